@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.comparison import LARGEST_K, look
-from calstudy.figures.signal_loss import SIGMAS_95
 from calstudy.plotting import style
 from calstudy.power.tables import load_spectrum
 from calstudy.power.windows import UnbiasedSpectrum, Windows

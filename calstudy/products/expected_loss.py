@@ -19,6 +19,7 @@ from calstudy.products import calibration, corruption
 from calstudy.products.calibration import Calibrated, prepared_fit
 from calstudy.products.files import (
     DATA,
+    EXPECTED,
     MODEL,
     SOLUTION,
     integration_times,
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from calstudy.calibrate.problem import CalibrationProblem
     from calstudy.power.spectra import BaselineModes
 
-EXPECTED, RESPONSE, AMPLITUDES = "expected-loss.h5", "linear-response.json", "amplitudes.npz"
+RESPONSE, AMPLITUDES = "linear-response.json", "amplitudes.npz"
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
 # further within a bin.
 PROBES = 16
