@@ -189,7 +189,11 @@ def read_contents(run: RunFolder) -> Contents:
         setup=manifest.get("setup", ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
-        warnings=[*excess, *(f"{label}: {text}" for label, text in _warnings(run.products))],
+        warnings=[
+            *excess,
+            *manifest.get("warnings", []),
+            *(f"{label}: {text}" for label, text in _warnings(run.products)),
+        ],
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),

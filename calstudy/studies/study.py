@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import cached_property
@@ -85,11 +86,22 @@ class Run:
     def warnings(self) -> list[str]:
         """Warnings of the stages, with the product concerned."""
         records = [product.record for product in self.made.products.values()]
-        return [
+        return removed(self.tasks, self.made.products) + [
             f"{record['stage']} ({record['label']}): {text}"
             for record in records
             for text in record["notes"].get("warnings", [])
         ]
+
+
+def removed(tasks: Iterable[Task], products: Container[str]) -> list[str]:
+    """Return a sentence if products that are kept, and whose warnings a run would show, are not in the store."""
+    counts = Counter(task.stage.name for task in tasks if not task.temporary and task.key not in products)
+    if not counts:
+        return []
+    named = ", ".join(f"{stage} {count}" for stage, count in counts.items())
+    return [
+        f"{counts.total()} products behind the results are no longer in the store ({named}), nor are their warnings"
+    ]
 
 
 class Study(ABC):
@@ -262,6 +274,7 @@ class Study(ABC):
             "captions": {task.label: task.settings["figure"].caption for task in self.figures},
             **({"parts": places} if places else {}),
             **self.entries,
+            "warnings": removed(self.recorded, made.products),
             "products": product_entries(
                 self.recorded, made.products, made.tasks, self.tables if self.keeps_tables else ()
             ),

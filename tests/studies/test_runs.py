@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -160,6 +161,20 @@ def test_a_damaged_product_is_told_and_rebuilt_to_the_same_figures(finished, fol
     assert stages_made(result) == {"power", "spectra", "figure"}
     # From the same calibration, so that nothing but the rounding of sums may differ.
     assert differences(before, arrays(result, "spherical")) == []
+
+
+def test_it_is_told_that_warnings_were_removed_with_their_products(finished, folder, tmp_path):
+    calibrations = next(iter(finished.made.products.values())).path.parents[1] / "calibrate"
+    calibrations.rename(tmp_path / "calibrate")
+    result, _ = run_here(of_the_paper(folder), folder)
+    (tmp_path / "calibrate").rename(calibrations)
+    assert result.made.tasks == ()
+    [told] = [text for text in result.warnings if "no longer in the store" in text]
+    assert re.fullmatch(r"\d+ products behind the results .* \(calibrate \d+\), nor are their warnings", told)
+    assert json.loads((result.folder / "manifest.json").read_text())["warnings"] == [told]
+    assert told in (result.folder / "report.html").read_text()
+    result, _ = run_here(of_the_paper(folder), folder)
+    assert json.loads((result.folder / "manifest.json").read_text())["warnings"] == []
 
 
 def test_a_run_folder_with_a_strangers_file_is_refused(finished, folder):
