@@ -167,6 +167,12 @@ MUTATIONS = (
         STORE,
     ),
     Mutation(
+        "warnings are lost with a damaged record",
+        "for task in (*targets, *without_record(targets, store)):",
+        "for task in targets:",
+        ("tests/run/test_perform.py",),
+    ),
+    Mutation(
         "a worker makes with other code",
         "if other := _other(order.made_with, made_with(order.task)):",
         'if other := "":',

@@ -111,7 +111,9 @@ def _require_room(order: WorkOrder) -> None:
 
     HDF5 crashes where the disk is full when it closes a file of which it could not write the head.
     """
-    if shutil.disk_usage(order.store).free < order.disk + SPARE:
+    disk = shutil.disk_usage(order.store)
+    # Some file systems of networks do not say their size.
+    if disk.total > 0 and disk.free < order.disk + SPARE:
         raise _disk_error(order, os.strerror(errno.ENOSPC))
 
 

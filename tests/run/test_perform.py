@@ -409,12 +409,12 @@ def test_a_product_that_cannot_be_written_is_told_in_a_sentence(tmp_path, make):
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.parametrize(("spare", "made"), [(101, True), (99, False)])
-def test_a_product_is_made_only_where_its_disk_has_room(spare, made, store, monkeypatch):
+@pytest.mark.parametrize(("total", "spare", "made"), [(1e12, 101, True), (1e12, 99, False), (0, 99, True)])
+def test_a_product_is_made_only_where_its_disk_has_room(total, spare, made, store, monkeypatch):
     """HDF5 crashes at some of the places where a write can fail, before anybody can say why."""
     task = Sized("sized", number=1)
-    free = SimpleNamespace(free=execution.SPARE + spare)
-    monkeypatch.setattr(execution.shutil, "disk_usage", lambda path: free)
+    disk = SimpleNamespace(total=total, free=execution.SPARE + spare)
+    monkeypatch.setattr(execution.shutil, "disk_usage", lambda path: disk)
     order = WorkOrder.of(task, store)
     if made:
         perform(order)
