@@ -5,8 +5,8 @@ takes some modes, and moves power between bins of k. T = P^D / P^S then depends 
 corrects no other), and what is lost of one bin cannot be told from what came from another.
 
 S is cut into parts S_j by |k|, inside the wedge and outside: a mode between the centres k_j and k_j+1 of two bins has a
-share of its power in the parts of both, so that P(k) is linear between the centres. Different modes are independent.
-For any such P(k), on average,
+share of its power in the parts of both, so that P(k) is linear between the centres; below the first and above the last
+it is constant. Different modes are independent. For such a P(k), the same at all modes of one |k|, on average
 
     P^S = A p,   P^D = B p,   A_ij = P_i(S_j),   B_ij = P_i(M S_j),
 
@@ -15,16 +15,16 @@ windows of the taper, B those of taper and calibration. The estimate
 
     P = U P^R,   U = A B^-1,
 
-has the windows of A, whatever P(k) is: it is what the spectrum would be without calibration. Deconvolving the taper as
-well, B^-1 P^R, would multiply the noise by the condition of A for little: the windows of A are a bin wide.
+has the windows of A: it is what the spectrum would be without calibration. Deconvolving the taper as well, B^-1 P^R,
+would multiply the noise by the condition of A for little: the windows of A are a bin wide.
 
 B is the mean of Re (M S_j)* (M' S_j) over the modes of a bin, where M and M' are those of the fits of two realizations
-of the noise, as P^R is even times odd. A and B come from one simulated EoR with another seed than that of the data,
-whose sample variance cancels in U: U B p = A p exactly. Its P(k) does not matter, but it should have power everywhere.
+of the noise, as P^R is even times odd. A and B come from one simulated EoR with another seed than that of the data. It
+is flat, so that P(k) itself is taken to be linear within a bin. For P(k) of k^-2.5 that leaves some per cent next to the
+wedge at k of 0.1 h/Mpc, where P(k) bends within a bin and T changes there.
 
-Bins stay out of which less than `LEAST_KEPT` is left: what they hold is from the edges of the bin and from other bins,
-and depends on the slope of P(k) there. Those stay out, too, where the fits do not follow their linear response
-(`follows`).
+Bins stay out of which less than `LEAST_KEPT` is left, and those where the fits do not follow their linear response
+(`follows`). Neighbouring bins of the estimate are correlated, since U mixes them.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from calstudy.power.spectra import BaselineModes, SphericalSpectrum
 LEAST_KEPT = 0.5
 """B_ii / A_ii below which bin i is not estimated."""
 LARGEST_DIFFERENCE = 0.1
-"""Of T of the linear response from the measured one, as a part of it, where a bin is estimated. Both are of the same
-EoR, whose sample variance they share."""
+"""Of T of the linear response from the measured one, as a part of it, where a bin is estimated. Both are of the EoR in
+the data, whose sample variance they share. The difference is a part of the error."""
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,9 @@ def unbiased(
 ) -> UnbiasedSpectrum:
     """Return U P^R of a spectrum outside the wedge in the same bins, and after them.
 
-    Noise passes through the fit as the EoR does, and has fewer modes afterwards: the error of P^R about P^S, for the
-    noise of the data, is divided by the root of T. What the fit leaves of one EoR differs by chance; that is added.
+    Its error adds three parts. Noise passes through the fit as the EoR does, and has fewer modes afterwards: the error
+    of P^R about P^S, for the noise of the data, is multiplied by the root of T, and goes through U. What the fit leaves
+    of one EoR differs by chance, as T does. And the fit may leave something else than its linear response does.
 
     Parameters
     ----------
@@ -205,19 +206,26 @@ def unbiased(
     transfer_error
         Relative standard deviation of T in each bin, of P^R and P^S of the same EoR, (at least Nk,).
     scale
-        Flux scale of the calibration, s: fitted gain products over the true ones.
+        Flux scale of the calibration, s: fitted gain products over the true ones. Its error is not included.
     """
     n_bins = found.k.size
     power = residual.power.real[:n_bins] * scale**2
-    known = found.estimated & np.isfinite(power)
-    estimate = found.undo @ np.where(known, power, 0.0)
-    kept = np.where(known, found.transfer, np.nan)
-    noise = residual.difference_error[:n_bins] / np.sqrt(kept)
+    usable = found.estimated & np.isfinite(power)
+    # A bin without power takes those with it that U mixes with it.
+    known = found.estimated & (np.abs(found.undo) @ (found.estimated & ~usable) == 0)
+    estimate = found.undo @ np.where(usable, power, 0.0)
+    kept = np.where(usable, found.transfer, 0.0)
+    noise = kept * np.where(usable, residual.difference_error[:n_bins], 0.0) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        chance = np.diag(found.undo) * kept * transfer_error[:n_bins]
+        path = found.measured / found.linear - 1
+        divided = np.where(known, power / kept, np.nan)
+    error = np.sqrt(found.undo**2 @ noise + estimate**2 * (chance**2 + path**2))
     return UnbiasedSpectrum(
         k=found.k,
         bin_edges=found.bin_edges,
         power=np.where(known, estimate, np.nan),
-        error=np.hypot(noise, estimate * transfer_error[:n_bins]),
+        error=np.where(known, error, np.nan),
         signal=signal.power.real[:n_bins],
-        divided=power / kept,
+        divided=divided,
     )

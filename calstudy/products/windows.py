@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from calstudy.base.resources import Cost
+from calstudy.base.resources import COMPLEX128, Cost
 from calstudy.base.table import Table
 from calstudy.experiment.model import Experiment, Variant
 from calstudy.power.settings import PowerSettings
@@ -17,7 +18,7 @@ from calstudy.products import corruption, signal_loss, simulation, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.expected_loss import NOT_OF_THE_FIT, Solved, baseline_modes, solved, why_no_response
 from calstudy.products.files import DATA, VISIBILITIES, spectrum_file
-from calstudy.products.graph import Graph, memoize
+from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
 
@@ -38,9 +39,9 @@ OTHER_SEED = 1_000_003
 """What is added to the seed of the EoR, so that the windows know nothing of the EoR in the data."""
 NOTE = (
     "Power outside the wedge in mK^2 h^-3 Mpc^3: of the EoR that was put in; estimated from the residual with the "
-    "windows of the calibration, which hold for an EoR of any slope; and the residual's power over T of a flat EoR. "
+    "windows of the calibration, for a P(k) that is linear within a bin; and the residual's power over T of a flat EoR. "
     "Bins are missing where the calibration leaves less than half, or not what its linear response leaves. One "
-    "standard deviation about the EoR that was put in."
+    "standard deviation about the EoR that was put in, for a flux scale that is known; neighbouring bins are correlated."
 )
 
 
@@ -79,6 +80,8 @@ def why_no_windows(experiment: Experiment) -> str:
     """Return why the windows of a calibration cannot be known; empty if they can."""
     if not experiment.measures_signal_loss:
         return "needs the variants residual, residual_without_eor and eor, from which the signal loss is measured"
+    if len(bin_edges(experiment.power)) < 3:
+        return f"needs two bins of power.bins or more below {LARGEST_K:g} h/Mpc"
     return why_no_response(experiment)
 
 
@@ -146,7 +149,9 @@ class BandResponses(Solved, stage="band-responses", version=1):
         }
 
     def _cost(self) -> Cost:
-        return self.cost_of(len(self.integrations) * len(bin_edges(self.power)))
+        size, parts = size_of(self), len(bin_edges(self.power))
+        disk = len(self.integrations) * parts * size.baselines * size.channels.count * COMPLEX128
+        return replace(self.cost_of(len(self.integrations) * parts), disk=disk)
 
 
 class MeasureWindows(Task, stage="windows", version=1, cost=Cost(2, disk=1e6)):
@@ -210,7 +215,8 @@ class MeasureWindows(Task, stage="windows", version=1, cost=Cost(2, disk=1e6)):
             for bin_ in range(found.k.size)
             if found.estimated[bin_]
         ]
-        return [Table(columns, rows, "Power spectrum without the calibration's part", NOTE)]
+        note = NOTE if rows else f"{NOTE} No bin is left, or no integration was solved in all antennas and channels."
+        return [Table(columns, rows, "Power spectrum without the calibration's part", note)]
 
 
 def bin_edges(power: PowerSettings) -> np.ndarray:
