@@ -38,7 +38,6 @@ W x|^2 - |f* M x|^2 is <f|W^2 - M^2|f>, and P x or M x cost one solve of the nor
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -283,14 +282,14 @@ class GainResponse:
         return tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
 
 
-def linear_responses(
-    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signals: Iterable[np.ndarray]
-) -> Iterator[np.ndarray]:
-    """Compute the residual of small signals after calibration, to first order, one after the other.
+def linear_response(
+    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signal: np.ndarray
+) -> np.ndarray:
+    """Compute the residual of a small signal after calibration, to first order.
 
-    In double precision: where foregrounds nearly follow the gains, single precision does not resolve the response.
     It is the difference of the residuals of two fits, of data with the signal and without, if both are at the minimum;
-    it does not depend on where these start and stop.
+    it does not depend on where these start and stop. Single precision does not resolve it where foregrounds nearly
+    follow the gains.
 
     Parameters
     ----------
@@ -298,25 +297,17 @@ def linear_responses(
         The fitted problem.
     gains, model
         The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    signals
-        Calibrated visibilities of each signal, (Nbls, Nfreqs), in the unit of the model.
+    signal
+        Calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model.
 
-    Yields
-    ------
+    Returns
+    -------
     Complex, (Nbls, Nfreqs); zero for samples without weight.
     """
     tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
-    for signal in signals:
-        left = tangent.without_foregrounds(tangent.roots * signal)
-        left = left - response.absorbed(tangent, left)
-        yield np.divide(left, tangent.roots, out=np.zeros(left.shape, complex), where=tangent.roots > 0)
-
-
-def linear_response(
-    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, signal: np.ndarray
-) -> np.ndarray:
-    """Compute the residual of one small signal after calibration; parameters are as for `linear_responses`."""
-    return next(linear_responses(problem, gains, model, [signal]))
+    left = tangent.without_foregrounds(tangent.roots * signal)
+    left = left - response.absorbed(tangent, left)
+    return np.divide(left, tangent.roots, out=np.zeros(left.shape, complex), where=tangent.roots > 0)
 
 
 def _stochastic_diagonal(

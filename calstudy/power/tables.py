@@ -15,19 +15,9 @@ from calstudy.power.expected import ExpectedBins
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.transfer import TransferFunction, TransferMap
-from calstudy.power.windows import UnbiasedSpectrum, Windows
 
 Spectrum = TypeVar(
-    "Spectrum",
-    DelaySpectra,
-    SphericalSpectrum,
-    CylindricalSpectrum,
-    TransferFunction,
-    TransferMap,
-    ExpectedBins,
-    Score,
-    Windows,
-    UnbiasedSpectrum,
+    "Spectrum", DelaySpectra, SphericalSpectrum, CylindricalSpectrum, TransferFunction, TransferMap, ExpectedBins, Score
 )
 
 CSV_COLUMNS = {

@@ -11,7 +11,7 @@ from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.settings import PowerSettings
@@ -56,60 +56,48 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 def expected_loss(graph: Graph) -> Task:
     """Return the task that predicts T for the middle integration."""
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
-    return ExpectedLoss(LABEL, probes=PROBES, power=power, integration=_middle(graph), **solved(graph))
+    return ExpectedLoss(LABEL, probes=PROBES, power=power, **_solved(graph))
 
 
 @memoize
 def linear_response(graph: Graph) -> Task | None:
-    """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T."""
-    if why_no_response(graph.experiment):
+    """Return the task of the linear response to the EoR itself, or None if it cannot be compared with T.
+
+    Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
+    baseline with itself, because a fit responds differently on different baselines of a group. Large arrays have none.
+    """
+    fit, power = graph.experiment.calibration, graph.experiment.power
+    fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
+    size = size_of_instrument(graph.experiment.instrument)
+    large = size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES
+    if not fits or large or power.pairs == "redundant-group":
         return None
-    power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin")
+    power = power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin")
     even, odd = (
         Response(
             f"response to the EoR to first order, {parity}",
             power=power,
             signal=corruption.data(graph, Variant(components=("eor",)), "even"),
-            integration=_middle(graph),
             temporary=True,
-            **solved(graph, parity),
+            **_solved(graph, parity),
         )
         for parity in corruption.PARITIES
     )
     return LinearResponse("linear response to the EoR", power=power, even=even, odd=odd)
 
 
-def why_no_response(experiment: Experiment) -> str:
-    """Return why the linear response of the fits of an experiment cannot be compared with T; empty if it can.
-
-    A fit responds differently on different baselines of a group.
-    """
-    fit, size = experiment.calibration, size_of_instrument(experiment.instrument)
-    if not (isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None):
-        return "needs a calibrator that fits each integration by least squares, and gains that are not smoothed"
-    if experiment.power.pairs == "redundant-group":
-        return "needs power.pairs: same-baseline"
-    if size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES:
-        return f"needs at most {LARGEST:g} times the baselines and channels of the paper"
-    return ""
-
-
-def _middle(graph: Graph) -> int:
-    return graph.experiment.instrument.times.count // 2
-
-
-def solved(graph: Graph, parity: str = "even") -> dict[str, Any]:
-    """Return the fields of `Solved` for the data of all components of one noise realization."""
+def _solved(graph: Graph, parity: str = "even") -> dict[str, Any]:
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
     return {
         **calibration.calibration_inputs(graph, residual, parity),
         "calibration": calibration.calibration(graph, residual, parity),
         "calibrator": graph.experiment.calibration.with_defaults("assumed"),
+        "integration": graph.experiment.instrument.times.count // 2,
     }
 
 
 @dataclass(frozen=True)
-class Solution:
+class _Solution:
     """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs)."""
 
     problem: CalibrationProblem
@@ -120,14 +108,15 @@ class Solution:
     frequency: np.ndarray
 
 
-class Solved(Calibrated):
-    """Calibrated integrations of simulated data."""
+class _Solved(Calibrated):
+    """A calibrated integration of simulated data."""
 
     calibration: Input
     calibrator: GainFit = called("calibration")
     power: PowerSettings
+    integration: int
 
-    def solution(self, integration: int) -> Solution | None:
+    def solution(self) -> _Solution | None:
         """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
         import numpy as np
 
@@ -135,23 +124,22 @@ class Solved(Calibrated):
         from calstudy.calibrate.records import Solve
         from calstudy.products.selection import read_gains
 
-        times = self.times(integration)
-        data, sky, noise = self.read(times)
+        data, sky, noise = self.read(self.times)
         prepared = prepared_fit(self.calibrator, data, sky, noise)
         fitted = read_gains(self.calibration)
-        gains = fitted.at(integration, prepared.data.numbers)
+        gains = fitted.at(self.integration, prepared.data.numbers)
         records = map(Solve.from_json, read_json(self.calibration / SOLUTION)["records"])
         record = next(
             found
             for found in records
             if found.polarization == data.polarization_array[0]
-            and found.integration <= integration < found.integration + found.n_integrations
+            and found.integration <= self.integration < found.integration + found.n_integrations
         )
         problem = problem_at(prepared, self.calibrator, slice(0, 1), 0, gains, record)
-        if isinstance(problem, str) or fitted.flags[integration].any():
+        if isinstance(problem, str) or fitted.flags[self.integration].any():
             return None
-        model = read_visibilities(self.calibration / MODEL, times)
-        return Solution(
+        model = read_visibilities(self.calibration / MODEL, self.times)
+        return _Solution(
             problem,
             gains,
             to_cube(model)[0, ..., 0],
@@ -160,27 +148,15 @@ class Solved(Calibrated):
             np.asarray(data.freq_array, float),
         )
 
-    def times(self, integration: int) -> np.ndarray:
-        """Julian date of an integration, (1,)."""
-        return integration_times(self.data / DATA)[[integration]]
-
-    def signal_at(self, solution: Solution, path: Path, integration: int) -> np.ndarray:
-        """Read the visibilities of a signal on the baselines of a solution, (Nbls, Nfreqs)."""
-        found = read_visibilities(path, self.times(integration))
-        places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(found).tolist())}
-        return to_cube(found)[0, [places[pair] for pair in solution.pairs], :, 0]
-
-    def cost_of(self, responses: int) -> Cost:
-        """Estimate the cost of some linear responses of one integration."""
-        size = size_of(self)
-        work = size.baselines * size.channels.count / PAPER_SAMPLES
-        return Cost(6 + 0.8 * responses * work, LIBRARIES_MEMORY + 2.5e9 * work, 1e6)
+    @property
+    def times(self) -> np.ndarray:
+        """Julian date of the integration, (1,)."""
+        return integration_times(self.data / DATA)[[self.integration]]
 
 
-class ExpectedLoss(Solved, stage="expected-loss", version=4):
+class ExpectedLoss(_Solved, stage="expected-loss", version=4):
     """The expected T of one calibrated integration."""
 
-    integration: int
     probes: int
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -189,7 +165,7 @@ class ExpectedLoss(Solved, stage="expected-loss", version=4):
         from calstudy.calibrate.expected_loss import expected_transfer as expected_of
         from calstudy.power.tables import save_spectrum
 
-        solution = self.solution(self.integration)
+        solution = self.solution()
         if solution is None:
             raise InputError(
                 f"expected-loss: integration {self.integration} was not calibrated in all antennas and channels, and "
@@ -202,13 +178,12 @@ class ExpectedLoss(Solved, stage="expected-loss", version=4):
         return {"integration": self.integration, "probes": self.probes}
 
     def _cost(self) -> Cost:
-        return self.cost_of(self.probes)
+        return _cost_of(self, self.probes, 1.5e9)
 
 
-class Response(Solved, stage="response", version=1):
+class Response(_Solved, stage="response", version=1):
     """The linear response of one calibrated integration to a signal."""
 
-    integration: int
     signal: Input
 
     def make(self, output: Path) -> Mapping[str, Any]:
@@ -218,9 +193,11 @@ class Response(Solved, stage="response", version=1):
         from calstudy.calibrate.expected_loss import DelayModes
         from calstudy.calibrate.expected_loss import linear_response as response_to
 
-        solution, arrays = self.solution(self.integration), {}
+        solution, arrays = self.solution(), {}
         if solution is not None:
-            signal = self.signal_at(solution, self.signal / DATA, self.integration)
+            eor = read_visibilities(self.signal / DATA, self.times)
+            places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(eor).tolist())}
+            signal = to_cube(eor)[0, [places[pair] for pair in solution.pairs], :, 0]
             left = response_to(solution.problem, solution.gains, solution.model, signal)
             modes = DelayModes(solution.frequency, self.power.taper)
             arrays = {
@@ -234,7 +211,14 @@ class Response(Solved, stage="response", version=1):
         return {}
 
     def _cost(self) -> Cost:
-        return self.cost_of(1)
+        return _cost_of(self, 1, 2.5e9)
+
+
+def _cost_of(task: _Solved, responses: int, memory: float) -> Cost:
+    """Return the cost of some linear responses, with the bytes of memory for the paper's array."""
+    size = size_of(task)
+    work = size.baselines * size.channels.count / PAPER_SAMPLES
+    return Cost(6 + 0.8 * responses * work, LIBRARIES_MEMORY + memory * work, 1e6)
 
 
 class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk=1e4)):
@@ -254,7 +238,7 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
             if not even.files or not odd.files:
                 write_json(output / RESPONSE, {"bands": None})
                 return {}
-            where = baseline_modes(even["delay"], even["lengths"], float(even["centre"]), self.power)
+            where = _modes(even["delay"], even["lengths"], float(even["centre"]), self.power)
             answers = even["left"], odd["left"]
             transfer, cross = bin_response(where, even["signal"], answers, BANDS, self.power.wedge_buffer)
         bands = [
@@ -265,7 +249,7 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
         return {}
 
 
-def baseline_modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
+def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
     """Return the modes of baselines (lengths in m) at delays (s), for the centre of the band (Hz)."""
     from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
     from calstudy.power.spectra import BaselineModes
@@ -283,6 +267,6 @@ def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power
     """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
     from calstudy.power.binned import make_bin_edges
 
-    modes = baseline_modes(expected.delay, lengths, centre, power)
+    modes = _modes(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)
     return bin_expected(modes, expected.transfer, expected.error, edges, power.wedge_buffer, power.length_bin)

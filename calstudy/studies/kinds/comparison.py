@@ -79,7 +79,7 @@ class ComparisonFile(Section):
     )
     figures: Figures = Field(
         default_factory=lambda: tuple(FIGURES.make(name) for name in ("comparison-matrix", "comparison-spectra")),
-        description="Figures of all cases: comparison-matrix, comparison-spectra, comparison-curves, unbiased-spectra.",
+        description="Figures of all cases: comparison-matrix, comparison-spectra, comparison-curves.",
     )
     salt: str = Field(
         "", description="Of a blind challenge (`calstudy export --blind`): digests of its data are made with it."
