@@ -224,7 +224,7 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
     example = unconverged[0]
     stalled = [
         "where solves stall, results depend on where they start: T is not determined better than by the spread of two "
-        "starts, which another 'calibration.chunks' shows"
+        "starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not depend on them"
     ]
     return (stalled if "stalled" in by_status else []) + [
         f"{len(unconverged)} of {len(records)} solves did not converge "
