@@ -76,7 +76,7 @@ def linear_response(graph: Graph) -> Task | None:
     even, odd = (
         Response(
             f"response to the EoR to first order, {parity}",
-            power=power,
+            power=power.with_defaults("wedge_buffer"),
             signal=corruption.data(graph, Variant(components=("eor",)), "even"),
             temporary=True,
             **_solved(graph, parity),
@@ -234,7 +234,10 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
 
         from calstudy.power.score import BANDS
 
-        with np.load(self.even / AMPLITUDES) as even, np.load(self.odd / AMPLITUDES) as odd:
+        with (
+            np.load(self.even / AMPLITUDES, allow_pickle=False) as even,
+            np.load(self.odd / AMPLITUDES, allow_pickle=False) as odd,
+        ):
             if not even.files or not odd.files:
                 write_json(output / RESPONSE, {"bands": None})
                 return {}

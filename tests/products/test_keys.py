@@ -44,6 +44,7 @@ DOWNSTREAM = {
     "difference",
     "agreement",
     "flux-scale",
+    "response",
     "linear-response",
 } | AVERAGED
 
@@ -61,7 +62,7 @@ DOWNSTREAM = {
             {"spectra", "figure", "agreement", "claims", "transfer", "linear-response", "score"},
         ),
         ("power.bins.width", "0.1 h/Mpc", {"spectra", "figure", "claims", "transfer", "score"}),
-        ("power.taper", "hann", AVERAGED | {"flux-scale", "linear-response"}),
+        ("power.taper", "hann", AVERAGED | {"flux-scale", "response", "linear-response"}),
         ("calibration.basis.buffer", "80 ns", DOWNSTREAM - {"levels", "corrupt"}),
         ("corruption.effects.0.seed", 99, {"effect", "gains"} | DOWNSTREAM - {"levels"}),
         ("corruption.effects.0.drift", {"kind": "jumps"}, {"effect", "gains"} | DOWNSTREAM - {"levels"}),
