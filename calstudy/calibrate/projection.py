@@ -48,7 +48,7 @@ class Roots(NamedTuple):
     first
         S of the models of a batch, or of its baselines if they have their own coefficients besides the shared ones,
         (N, Nvec, rank).
-    shared : s of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise
+    shared : S of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise
     """
 
     first: tf.Tensor
@@ -73,7 +73,7 @@ class Projection(NamedTuple):
     ----------
     loss
         sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior; scalar, float64.
-    model : f on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), float64
+    model : F on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), float64
     descent : minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64
     parts : linearizations of the stretches
     """

@@ -42,7 +42,7 @@ class Diagnostics:
     lengths : baseline lengths in m, ascending, (Nbls,)
     data, model, residual
         Delay transform after a Blackman-Harris taper, rms over integrations, (Nbls, Ndelays); flagged samples are zero.
-    frequency : hz, (Nfreqs,)
+    frequency : Hz, (Nfreqs,)
     antennas : names of the antennas that are drawn, (Nshown,)
     gains : complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs)
     losses : loss after each step over the first loss of its own solve, one array for each solve

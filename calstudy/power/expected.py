@@ -21,7 +21,7 @@ class ExpectedBins:
         T outside the wedge and its standard deviation from random probes, (Nk,); NaN in bins without modes.
     length_edges : lower and upper edge of each bin of baseline length, m, (Nb, 2)
     delay : from zero up, s, (Nd,)
-    by_length : t per length and delay, both signs of the delay together, (Nb, Nd)
+    by_length : T per length and delay, both signs of the delay together, (Nb, Nd)
     """
 
     k: np.ndarray = field(metadata={"unit": "h/Mpc"})

@@ -57,7 +57,7 @@ class Score:
     Attributes
     ----------
     k, bin_edges : bin centres (Nk,) and edges (Nk + 1,), h/Mpc
-    transfer, transfer_error : t s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known
+    transfer, transfer_error : T s^2, free of the flux scale s, and its standard deviation, (Nk,); NaN if s is not known
     cross_transfer
         C s, the coefficient of the regression of the response on the EoR, (Nk,); NaN if s is not known. At the minimum
         of a fit with free foregrounds and the weights of the spectra it equals T s^2; with a finite prior it is larger.
@@ -86,7 +86,7 @@ class Difference:
     Attributes
     ----------
     bin_edges : (Nk + 1,), h/Mpc
-    transfer, transfer_error : t s^2 of the first less that of the second, and its standard deviation, (Nk,)
+    transfer, transfer_error : T s^2 of the first less that of the second, and its standard deviation, (Nk,)
     bias, bias_error : the same of s^2 P^R0 / P^S
     """
 

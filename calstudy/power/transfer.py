@@ -129,8 +129,8 @@ class TransferFunction:
     Attributes
     ----------
     k, bin_edges : bin centres (Nk,) and edges (Nk + 1,), h/Mpc
-    transfer, transfer_error : t = P^D / P^S and its standard deviation, (Nk,)
-    cross_transfer, cross_transfer_error : c = Re <S* D> / P^S and its standard deviation, (Nk,)
+    transfer, transfer_error : T = P^D / P^S and its standard deviation, (Nk,)
+    cross_transfer, cross_transfer_error : C = Re <S* D> / P^S and its standard deviation, (Nk,)
     scale_free_transfer, scale_free_transfer_error
         T s^2, the transfer function free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     squared_coherence, squared_coherence_error

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import antenna_pairs, to_cube
+from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
@@ -98,12 +98,12 @@ def _solved(graph: Graph, parity: str = "even") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Solution:
-    """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs)."""
+    """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs), pairs (Nbls, 2)."""
 
     problem: CalibrationProblem
     gains: np.ndarray
     model: np.ndarray
-    pairs: list[tuple[int, int]]
+    pairs: np.ndarray
     lengths: np.ndarray
     frequency: np.ndarray
 
@@ -143,7 +143,7 @@ class _Solved(Calibrated):
             problem,
             gains,
             to_cube(model)[0, ..., 0],
-            [(int(first), int(second)) for first, second in antenna_pairs(model)],
+            antenna_pairs(model),
             prepared.data.lengths,
             np.asarray(data.freq_array, float),
         )
@@ -196,8 +196,7 @@ class Response(_Solved, stage="response", version=1):
         solution, arrays = self.solution(), {}
         if solution is not None:
             eor = read_visibilities(self.signal / DATA, self.times)
-            places = {tuple(pair): row for row, pair in enumerate(antenna_pairs(eor).tolist())}
-            signal = to_cube(eor)[0, [places[pair] for pair in solution.pairs], :, 0]
+            signal = to_cube(eor)[0, rows_of(eor, solution.pairs), :, 0]
             left = response_to(solution.problem, solution.gains, solution.model, signal)
             modes = DelayModes(solution.frequency, self.power.taper)
             arrays = {
