@@ -1,4 +1,4 @@
-"""The command line: ``calstudy init | run | plan | calibrate | claims | report | regress | validate | data | ...``.
+"""The command line: ``calstudy init | which | run | plan | calibrate | claims | report | regress | validate | ...``.
 
 Only light modules are imported here, so that ``calstudy --help`` answers at once.
 """
@@ -28,6 +28,7 @@ from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
 from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
+from calstudy.cli.which import which
 
 app = typer.Typer(
     cls=Sections,
@@ -47,6 +48,7 @@ app.command()(leaderboard)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
 app.command()(init)
+app.command()(which)
 app.command()(runs)
 app.command()(store)
 

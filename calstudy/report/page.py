@@ -20,7 +20,7 @@ from calstudy.base.table import Table
 from calstudy.report.headline import Number, read_headline, read_signal
 from calstudy.results.reader import EXPERIMENT, MANIFEST, RunFolder
 from calstudy.run.progress import duration
-from calstudy.verdicts.standing import answers, standing_table
+from calstudy.verdicts.standing import advice, standing_table
 from calstudy.verdicts.tables import CLAIMS_JSON, tally, verdict_table
 
 # Series in the order of the legend: field, label, and name of the colour in page.css.
@@ -197,7 +197,7 @@ def read_contents(run: RunFolder) -> Contents:
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),
-        answers=answers(found),
+        answers=advice(found),
         files=_files(run.path),
         parts=_parts(run),
         experiment=text,
