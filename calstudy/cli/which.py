@@ -27,7 +27,7 @@ Layout = Annotated[
     str,
     typer.Argument(
         metavar="LAYOUT",
-        help="CSV file with columns east_m, north_m, up_m, or the name of a layout, such as hera-37.",
+        help="Table of east_m, north_m, up_m, or of latitude, longitude, height_m (CSV); or a layout, such as hera-37.",
         show_default=False,
     ),
 ]
@@ -86,7 +86,7 @@ def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
     """
     from calstudy.instrument.settings import LAYOUTS
 
-    changes = {"instrument.layout": _block(layout, "csv", (".csv",))}
+    changes = {"instrument.layout": _block(layout, "csv", (".csv", ".txt"))}
     if site is not None:
         changes["instrument.location"] = _place(site)
     if beam is None:

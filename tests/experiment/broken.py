@@ -150,7 +150,7 @@ LAYOUTS = {
     "negative number": "east_m,north_m,up_m,number\n0,0,0,-1\n14,0,0,1\n28,0,0,2\n",
     "fractional number": "east_m,north_m,up_m,number\n0,0,0,1.5\n14,0,0,1\n28,0,0,2\n",
     "not text": "\x00\x01\x02\xff",
-    "semicolons": "east_m;north_m;up_m\n0;0;0\n14;0;0\n",
+    "decimal commas": "east_m;north_m;up_m\n0;0;0\n14,5;0;0\n",
 }
 """Bad tables of antenna positions."""
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from pyuvdata.utils import ENU_from_ECEF
+from pyuvdata.utils import ECEF_from_ENU, ENU_from_ECEF, LatLonAlt_from_XYZ
 
 from calstudy.base.errors import InputError
 from calstudy.instrument.array_layouts.csv import CsvLayout
@@ -139,8 +139,45 @@ def test_csv_layout(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        # The layout format of pyuvsim, and what spreadsheets write.
+        "# core\nName  Number  BeamID  E  N  U\na  7  0  0  0  0\n# broken\nb  3  0  10  2.5  -1\n",
+        "Name;Number;East;North;Up\na;7;0;0;0\nb;3;10;2.5;-1\n",
+        "\ufeffname\tnumber\teast_m\tnorth_m\tup_m\r\na\t7\t0\t0\t0\r\n\r\nb\t3\t10\t2.5\t-1\r\n",
+    ],
+)
+def test_tables_of_other_programs_are_read(tmp_path, text):
+    path = tmp_path / "array.csv"
+    path.write_text(text, encoding="utf-8", newline="")
+    layout = make_layout(CsvLayout(kind="csv", path=path))
+    assert layout.names == ("a", "b")
+    assert layout.numbers.tolist() == [7, 3]
+    np.testing.assert_array_equal(layout.enu, [[0, 0, 0], [10, 2.5, -1]])
+
+
+def test_latitudes_and_longitudes_become_distances(tmp_path):
+    enu = make_layout(HeraLayout(kind="hera-19")).enu
+    place = SITES["hera"]
+    # An independent conversion, by pyuvdata.
+    ecef = ECEF_from_ENU(enu, center_loc=place.location)
+    latitude, longitude, height = LatLonAlt_from_XYZ(ecef)
+    rows = zip(np.degrees(latitude), np.degrees(longitude), height, strict=True)
+    lines = [f"{lat:.10f}, {lon:.10f}, {up:.4f}" for lat, lon, up in rows]
+    path = tmp_path / "array.csv"
+    path.write_text("\n".join(["lat, lon, altitude", *lines]), encoding="utf-8")
+    found = make_layout(CsvLayout(kind="csv", path=path)).enu
+    # Positions are about the mean; ten digits of a degree are a hundredth of a millimetre.
+    np.testing.assert_allclose(found - found.mean(axis=0), enu - enu.mean(axis=0), atol=2e-3)
+
+
+@pytest.mark.parametrize(
     ("text", "complaint"),
     [
+        ("latitude,longitude\n-30,21\n-30,21\n", "height_m"),
+        ("latitude,longitude,height_m\n-30,21,0\n30,21,0\n", "one degree"),
+        ("e,east_m,n,u\n0,0,0,0\n1,1,1,1\n", "twice"),
+        ("e n u\n0 0 0\n1 1\n", "cells"),
         ("east_m,north_m\n0,0\n1,1\n", "up_m"),
         ("east_m,north_m,up_m\n0,0,0\n1,x,0\n", "not a number"),
         ("east_m,north_m,up_m\n0,0,0\n", "two rows"),

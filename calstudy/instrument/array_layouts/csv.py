@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,19 +12,34 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
-from calstudy.instrument.layouts import SITES, ArrayLayout, Layout
+from calstudy.instrument.layouts import SITES, ArrayLayout, Layout, Place, east_north_up
+
+COLUMNS = {
+    "east_m": ("e", "east"),
+    "north_m": ("n", "north"),
+    "up_m": ("u", "up"),
+    "latitude": ("lat", "latitude_deg"),
+    "longitude": ("lon", "long", "longitude_deg"),
+    "height_m": ("height", "alt", "altitude"),
+    "name": (),
+    "number": (),
+}
+"""Columns and their other names, in small letters; those of one letter are pyuvsim's."""
+LOCAL, GEODETIC = ("east_m", "north_m", "up_m"), ("latitude", "longitude", "height_m")
 
 
 class CsvLayout(ArrayLayout):
-    """Positions from a CSV file with columns east_m, north_m, up_m and, optionally, name and number.
+    """Positions from a table with columns east_m, north_m, up_m, or latitude and longitude in degrees and height_m.
 
-    It needs `instrument.location`: such a table does not say where the array is.
+    `name` and `number` are optional columns, others are ignored. Columns are separated by commas, semicolons, tabs or
+    spaces, so that pyuvsim's files (Name Number BeamID E N U) can be used; lines that begin with # are comments.
+    It needs `instrument.location`: such a table does not say where the array is, or not exactly.
     """
 
     site: ClassVar[str | None] = None
 
     kind: str = "csv"
-    path: Path = Field(strict=False, description="CSV file, relative to the experiment file or absolute.")
+    path: Path = Field(strict=False, description="The table, relative to the experiment file or absolute.")
 
     @property
     def origin(self) -> str:
@@ -39,29 +56,64 @@ class CsvLayout(ArrayLayout):
         """
         if not self.path.is_file():
             raise InputError(f"instrument.layout.path: there is no file {self.path}")
-        try:
-            with self.path.open(newline="", encoding="utf-8-sig") as table:
-                rows = list(csv.DictReader(table))
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"instrument.layout.path: {self.path} is not a CSV file in UTF-8 ({error})") from None
-        uneven = next((line for line, row in enumerate(rows, 2) if None in row or None in row.values()), None)
-        if uneven is not None:
-            raise InputError(
-                f"instrument.layout.path: row {uneven} of {self.path} has more or fewer cells than the first"
-            )
+        rows = _read_rows(self.path)
         columns = set(rows[0]) if rows else set()
-        missing = {"east_m", "north_m", "up_m"} - columns
+        geodetic = {"latitude", "longitude"} <= columns
+        missing = set(GEODETIC if geodetic else LOCAL) - columns
         if missing or len(rows) < 2:
             raise InputError(
-                f"instrument.layout.path: {self.path} needs at least two rows with columns east_m, north_m, up_m"
-                + (f"; missing: {', '.join(sorted(missing))}" if missing else "")
+                f"instrument.layout.path: {self.path} needs at least two rows with columns east_m, north_m, up_m, or "
+                "latitude, longitude, height_m" + (f"; missing: {', '.join(sorted(missing))}" if missing else "")
             )
         try:
-            enu = np.array([[float(row[f"{axis}_m"]) for axis in ("east", "north", "up")] for row in rows])
+            positions = np.array([[float(row[name]) for name in (GEODETIC if geodetic else LOCAL)] for row in rows])
             numbers = np.array([int(row["number"]) for row in rows]) if "number" in columns else np.arange(len(rows))
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"instrument.layout.path: {self.path} holds an entry that is not a number ({error})"
             ) from None
+        if geodetic:
+            positions = _about_their_mean(positions, self.path)
         names = tuple(row["name"] for row in rows) if "name" in columns else tuple(f"ant{n:03d}" for n in numbers)
-        return Layout(self.path.stem, numbers, names, enu, SITES["mwa"])
+        return Layout(self.path.stem, numbers, names, positions, SITES["mwa"])
+
+
+def _read_rows(path: Path) -> Sequence[Mapping[str, str]]:
+    """Return the rows of a table by the names in `COLUMNS`; raises InputError if it is none."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        lines = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        if lines and not re.search("[,;\t]", lines[0]):
+            lines = [re.sub(r"\s+", "\t", line) for line in lines]
+        separator = next((mark for mark in (",", ";", "\t") if lines and mark in lines[0]), ",")
+        cells = list(csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"instrument.layout.path: {path} is not a CSV file in UTF-8 ({error})") from None
+    header, *rows = [[cell.strip() for cell in row] for row in cells] or [[]]
+    uneven = next((row for row in rows if len(row) != len(header)), None)
+    if uneven is not None:
+        raise InputError(
+            f"instrument.layout.path: row {separator.join(uneven)!r} of {path} has more or fewer cells than the first"
+        )
+    known = {other: name for name, others in COLUMNS.items() for other in (name, *others)}
+    names = [known.get(cell.lower(), cell) for cell in header]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"instrument.layout.path: {path} has the column {twice} twice")
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _about_their_mean(geodetic: np.ndarray, path: Path) -> np.ndarray:
+    """Return east, north, up of latitudes and longitudes in degrees and heights in m, (Nants, 3), about their mean."""
+    from astropy.coordinates import EarthLocation
+
+    latitudes, longitudes, heights = geodetic.T
+    if not (np.abs(latitudes) <= 90).all() or np.ptp(longitudes) > 1 or np.ptp(latitudes) > 1:
+        raise InputError(
+            f"instrument.layout.path: latitudes in {path} must be from -90 to 90 degrees, and all within one degree"
+        )
+    place = Place(latitudes.mean(), longitudes.mean(), heights.mean())
+    found = EarthLocation.from_geodetic(longitudes, latitudes, heights)
+    vectors = np.column_stack([axis.to_value("m") for axis in found.geocentric])
+    centre = [axis.to_value("m") for axis in place.location.geocentric]
+    return east_north_up(vectors - centre, place)
