@@ -1,4 +1,4 @@
-"""The command line: ``calstudy init | run | plan | calibrate | claims | report | regress | validate | data | ...``.
+"""The command line: ``calstudy init | which | run | plan | calibrate | claims | report | regress | validate | ...``.
 
 Only light modules are imported here, so that ``calstudy --help`` answers at once.
 """
@@ -28,6 +28,7 @@ from calstudy.cli.export import export, leaderboard, score
 from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
 from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
+from calstudy.cli.which import which
 
 app = typer.Typer(
     cls=Sections,
@@ -47,6 +48,7 @@ app.command()(leaderboard)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
 app.command()(init)
+app.command()(which)
 app.command()(runs)
 app.command()(store)
 
@@ -178,25 +180,28 @@ def claims(
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="The folder of a finished run.", show_default=False)],
-    other: Annotated[Path | None, typer.Argument(help="A second run, to be shown beside it.")] = None,
+    others: Annotated[list[Path] | None, typer.Argument(help="More runs, to be shown beside it.")] = None,
     output: Annotated[
-        Path | None, typer.Option(help="Page of two runs; by default FOLDER-and-OTHER.html here.")
+        Path | None, typer.Option(help="Page of several runs; by default FOLDER-and-OTHER.html here.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the page of two runs.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the page of several runs.")] = False,
 ) -> None:
     """Write the report of a finished run, one self-contained page, report.html, into its folder.
 
-    With two runs, write a page with both side by side: fields that differ, verdicts, figures and tables.
+    With several runs, write a page with all: power spectra and T in one chart each, and side by side fields that
+    differ, verdicts, figures and tables.
     """
-    from calstudy.report.page import write_pair, write_report
+    from calstudy.report.page import write_report
+    from calstudy.report.several import write_several
 
-    if other is None:
+    if not others:
         if output is not None or overwrite:
-            raise InputError("--output, --overwrite: are for the page of two runs")
+            raise InputError("--output, --overwrite: are for the page of several runs")
         typer.echo(f"{write_report(folder)}")
         return
-    output = output or Path(f"{folder.resolve().name}-and-{other.resolve().name}.html")
-    typer.echo(f"{write_pair(folder, other, output, overwrite)}")
+    folders = [folder, *others]
+    output = output or Path(f"{'-and-'.join(one.resolve().name for one in folders)}.html")
+    typer.echo(f"{write_several(folders, output, overwrite)}")
 
 
 @app.command()

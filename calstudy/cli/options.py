@@ -36,7 +36,7 @@ Scheduler = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 
 SECTIONS = {
-    "Every day": ("init", "plan", "run", "calibrate", "report"),
+    "Every day": ("init", "which", "plan", "run", "calibrate", "report"),
     "Results": ("claims", "compare-gains", "runs", "store"),
     "Other programs": ("export", "score", "leaderboard"),
     "Reference": ("fields", "data"),

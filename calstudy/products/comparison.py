@@ -18,7 +18,7 @@ from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.measured import is_measured, marked
-from calstudy.verdicts.standing import answers, standing_table, standings
+from calstudy.verdicts.standing import advice, standing_table, standings
 
 CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
@@ -107,7 +107,7 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=4):
+class Comparison(Task, stage="comparison", version=5):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
 
     title: str
@@ -215,7 +215,7 @@ def _markdown(
         "",
         f"## {answer.title}",
         "",
-        *(f"- {sentence}" for sentence in answers(standing)),
+        *(f"- {sentence}" for sentence in advice(standing)),
         "",
         answer.markdown(numbers=False),
         answer.note,

@@ -1,4 +1,4 @@
-"""The report of a run, or of two side by side, as one self-contained HTML page."""
+"""The report of a run as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ import base64
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
-import yaml
 
 from calstudy.base.errors import InputError
-from calstudy.base.paths import leaves
 from calstudy.base.table import Table
 from calstudy.report.headline import Number, read_headline, read_signal
 from calstudy.results.reader import EXPERIMENT, MANIFEST, RunFolder
 from calstudy.run.progress import duration
-from calstudy.verdicts.standing import answers, standing_table
+from calstudy.verdicts.standing import advice, standing_table
 from calstudy.verdicts.tables import CLAIMS_JSON, tally, verdict_table
 
 # Series in the order of the legend: field, label, and name of the colour in page.css.
@@ -89,15 +86,22 @@ def _transfer(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
 
 def _curves(title: str, label: str, logarithmic: bool, found: Mapping[str, tuple[np.ndarray, ...]]) -> Chart:
     ordered = [name for name in SERIES if name in found] + [name for name in found if name not in SERIES]
-    series = []
-    for name in ordered:
-        k, value, error = found[name]
-        kept = np.isfinite(value)
-        text, colour = SERIES.get(name, (name.replace("_", " "), "grey"))
-        rounded = {key: _rounded(array[kept]) for key, array in (("x", k), ("y", value), ("error", error))}
-        series.append({"label": text, "colour": colour, **rounded})
-    data = {"kind": "curves", "x": "k [h/Mpc]", "y": label, "logarithmic": logarithmic, "series": series}
-    return Chart(title, data)
+    series = [curve(*SERIES.get(name, (name.replace("_", " "), "grey")), found[name]) for name in ordered]
+    return chart_of_curves(title, label, logarithmic, series)
+
+
+def curve(label: str, colour: str, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
+    """Return a series of a chart: k in h/Mpc, values and errors where values are finite."""
+    kept = np.isfinite(points[1])
+    rounded = {key: _rounded(array[kept]) for key, array in zip(("x", "y", "error"), points, strict=True)}
+    return {"label": label, "colour": colour, **rounded}
+
+
+def chart_of_curves(title: str, label: str, logarithmic: bool, series: Sequence[Mapping[str, Any]]) -> Chart:
+    """Return a chart over k; `label` is that of the vertical axis."""
+    return Chart(
+        title, {"kind": "curves", "x": "k [h/Mpc]", "y": label, "logarithmic": logarithmic, "series": list(series)}
+    )
 
 
 def _maps(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
@@ -197,7 +201,7 @@ def read_contents(run: RunFolder) -> Contents:
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),
-        answers=answers(found),
+        answers=advice(found),
         files=_files(run.path),
         parts=_parts(run),
         experiment=text,
@@ -323,89 +327,15 @@ def _stages(products: Sequence[Mapping[str, Any]]) -> Table | None:
 
 
 REPORT = "report.html"
-ALWAYS_DIFFERENT = ("name", "description", "outputs")
-"""Sections of an experiment whose differences do not concern its results."""
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two runs, and their common contents.
-
-    Names are those of the runs, or of their folders if both runs have one name. Differences are the fields of the
-    experiments that differ. Claims, the papers' statements with the verdicts on both, are None if neither run has
-    any. A picture or table is None where one of the runs lacks it.
-    """
-
-    first: Contents
-    second: Contents
-    names: tuple[str, str]
-    differences: Table
-    claims: Table | None
-    pictures: list[tuple[Picture | None, Picture | None]]
-    tables: list[tuple[str, Table | None, Table | None]]
-
-
-def read_pair(folders: tuple[Path, Path]) -> Pair:
-    """Read two run folders; raises InputError if one of them is not that of a finished run."""
-    first, second = (read_contents(RunFolder(folder)) for folder in folders)
-    names = (first.title, second.title)
-    if first.title == second.title:
-        names = (folders[0].resolve().name, folders[1].resolve().name)
-    pictures = _matched({item.name: item for item in first.pictures}, {item.name: item for item in second.pictures})
-    tables = _matched({item.title: item for item in first.tables}, {item.title: item for item in second.tables})
-    claims = tables.pop(CLAIMS_TITLE, None)
-    return Pair(
-        first,
-        second,
-        names,
-        _differences(first.experiment, second.experiment, names),
-        None if claims is None else _claims(*claims, names),
-        list(pictures.values()),
-        [(title, *both) for title, both in tables.items()],
-    )
-
-
-def _matched(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    return {name: (first.get(name), second.get(name)) for name in [*first, *second]}
-
-
-def _differences(first: str, second: str, names: tuple[str, str]) -> Table:
-    fields = [dict(leaves(yaml.safe_load(text) or {})) if text else {} for text in (first, second)]
-    rows = [
-        (name, *(str(found.get(name, "-")) for found in fields))
-        for name in dict.fromkeys([*fields[0], *fields[1]])
-        if fields[0].get(name) != fields[1].get(name) and name.partition(".")[0] not in ALWAYS_DIFFERENT
-    ]
-    note = "" if rows else "The experiments do not differ."
-    return Table(("field", *names), rows, "Fields that differ", note)
-
-
-def _claims(first: Table | None, second: Table | None, names: tuple[str, str]) -> Table | None:
-    """Return one row for each statement, with the numbers and the verdicts of both runs."""
-    rows: dict[tuple[str, ...], list[tuple[str, str] | None]] = {}
-    for side, table in enumerate((first, second)):
-        for row in table.rows if table is not None else ():
-            section, sentence, quantity, measured, threshold, verdict = row
-            rows.setdefault((section, sentence, quantity, threshold), [None, None])[side] = (measured, verdict)
-    cells = [
-        (*statement, *(text for pair in zip_longest(*(side or ("", "") for side in sides)) for text in pair))
-        for statement, sides in rows.items()
-    ]
-    columns = ("section", "sentence", "measured is", "must be", *names, *(f"verdict, {name}" for name in names))
-    return Table(columns, cells, CLAIMS_TITLE) if cells else None
 
 
 def render(contents: Contents) -> str:
     """Return the page with its pictures, style and script."""
-    return _page("page.html", contents=contents, images=_images(contents))
+    return page_of("page.html", contents=contents, images=images_of(contents))
 
 
-def render_pair(pair: Pair) -> str:
-    """Return the page of two runs side by side."""
-    return _page("pair.html", pair=pair, images=[_images(pair.first), _images(pair.second)])
-
-
-def _page(template: str, **values: Any) -> str:
+def page_of(template: str, **values: Any) -> str:
+    """Return the page of a template, with its style and script."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -419,7 +349,8 @@ def _page(template: str, **values: Any) -> str:
     return environment.get_template(template).render(css=css, script=script, **values)
 
 
-def _images(contents: Contents) -> dict[str, str]:
+def images_of(contents: Contents) -> dict[str, str]:
+    """Return the pictures of a run by name, encoded for the page."""
     return {picture.name: base64.b64encode(picture.path.read_bytes()).decode("ascii") for picture in contents.pictures}
 
 
@@ -428,20 +359,11 @@ def write_report(folder: Path) -> Path:
 
     Raises InputError for other folders.
     """
-    return _write(render(read_contents(RunFolder(folder))), folder / REPORT)
+    return write_page(render(read_contents(RunFolder(folder))), folder / REPORT)
 
 
-def write_pair(first: Path, second: Path, output: Path, overwrite: bool = False) -> Path:
-    """Write the page of two runs, completely or not at all, and return its path.
-
-    Raises InputError if a folder is not that of a finished run, or the file exists and `overwrite` is false.
-    """
-    if output.exists() and not overwrite:
-        raise InputError(f"{output}: exists; choose another --output, or --overwrite it")
-    return _write(render_pair(read_pair((first, second))), output)
-
-
-def _write(page: str, path: Path) -> Path:
+def write_page(page: str, path: Path) -> Path:
+    """Write a page, completely or not at all, and return its path; raises InputError if it cannot be written."""
     partial = path.with_name(f".{path.name}-{uuid4().hex}")
     try:
         partial.write_text(page, encoding="utf-8")

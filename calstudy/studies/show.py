@@ -20,7 +20,7 @@ from calstudy.run.progress import duration
 from calstudy.run.store import Store, require_writable
 from calstudy.run.task import Task
 from calstudy.studies.study import Run, Study, said_of_other_code
-from calstudy.verdicts.standing import answers, standing_table
+from calstudy.verdicts.standing import advice, standing_table
 from calstudy.verdicts.tables import BY_SOLVER_MARKDOWN, CLAIMS_MARKDOWN, measured, tally
 
 NAMED = 8
@@ -195,7 +195,7 @@ def _show_answer(folder: Path, console: Console) -> None:
     table = standing_table(found)
     table.show(console, numbers=False)
     console.print(table.note, markup=False)
-    for sentence in answers(found):
+    for sentence in advice(found):
         console.print(sentence, markup=False)
 
 

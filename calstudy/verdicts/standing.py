@@ -30,7 +30,9 @@ LIMIT = 0.1
 SIGMAS = 2.0
 AT_LIMIT = 1.05
 NAMED = 3
-"""Number of worlds that are named; others are counted."""
+"""Number of worlds, and of calibrators that fail in few, that are named; others are counted."""
+MORE = 0.02
+"""By how much T of a calibrator that fails in few worlds must be larger for it to be named."""
 
 
 @dataclass(frozen=True)
@@ -159,25 +161,38 @@ def _in_world(world: str, band: Mapping[str, Any]) -> InWorld:
     return InWorld(world, transfer, transfer_error, bias, bias_error)
 
 
-def answers(found: Sequence[InBand]) -> list[str]:
-    """Return the question, and for each band of k which calibrators pass or are open."""
+def advice(found: Sequence[InBand]) -> list[str]:
+    """Return the question, and for each band of k which calibrator to take and what would break it first."""
     n_worlds = len({world.world for entry in found for world in entry.worlds})
     sentences = [f"Bias below {found[0].limit:g} of the EoR in all {n_worlds} worlds?"] if found else []
     for low, high in dict.fromkeys(entry.band for entry in found):
         entries = [entry for entry in found if entry.band == (low, high)]
-        passed, undecided = (_listed(entries, standing) for standing in ("passes", "open"))
-        failed = sum(entry.standing == "fails" for entry in entries)
-        parts = [f"{passed} pass" if passed else "no calibrator passes"]
-        parts += [f"open: {undecided}"] if undecided else []
-        parts += [f"{failed} of {len(entries)} fail"] if failed else []
-        sentences.append(f"k {low:g} to {high:g} h/Mpc: {'; '.join(parts)}")
+        sentences.append(f"k {low:g} to {high:g} h/Mpc: {'; '.join(_advice_in_band(entries))}")
     return sentences
 
 
-def _listed(entries: Sequence[InBand], standing: Standing) -> str:
-    """Name the calibrators with a standing, those with the largest T first."""
-    found = sorted((entry for entry in entries if entry.standing == standing), key=lambda entry: -entry.transfer)
-    return ", ".join(f"{entry.calibrator} ({entry.numbers})" for entry in found)
+def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
+    """Name the passing calibrator with the largest T first, then others that pass, are open, or fail in few worlds."""
+    ranked = sorted(entries, key=lambda entry: -entry.transfer if math.isfinite(entry.transfer) else math.inf)
+    passed, undecided, failed = (
+        [entry for entry in ranked if entry.standing == standing] for standing in ("passes", "open", "fails")
+    )
+    parts, least = ["no calibrator passes"], 0.0
+    if passed:
+        first, *others = passed
+        parts, least = [f"take {first.calibrator} ({first.numbers})"], first.transfer + MORE
+        if len(first.worlds) > 1:
+            parts.append(f"its bias is largest in {first.decisive[0].world}")
+        parts += [f"others that pass: {_listed(others)}"] if others else []
+    parts += [f"open: {_listed(undecided)}"] if undecided else []
+    tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
+    parts += [f"{entry.calibrator} keeps more (T ≥ {entry.transfer:.2f}), but {entry}" for entry in tempting[:NAMED]]
+    rest = len(failed) - len(tempting[:NAMED])
+    return [*parts, f"{rest} of {len(entries)} fail"] if rest else parts
+
+
+def _listed(entries: Sequence[InBand]) -> str:
+    return ", ".join(f"{entry.calibrator} ({entry.numbers})" for entry in entries)
 
 
 def standing_table(found: Sequence[InBand]) -> Table:

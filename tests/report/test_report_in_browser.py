@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from test_report import CLAIM, MANIFEST, PNG
 
-from calstudy.report.page import write_pair, write_report
+from calstudy.report.page import write_report
+from calstudy.report.several import write_several
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine")
@@ -85,7 +86,7 @@ def test_two_runs_work_side_by_side(folder, tmp_path_factory):
     other = tmp_path_factory.mktemp("other")
     shutil.copytree(folder, other, dirs_exist_ok=True)
     (other / "experiment.yaml").write_text("name: demo\nsky: {seed: 2}\n")
-    page = write_pair(folder, other, other / "both.html")
+    page = write_several([folder, other], other / "both.html")
     found = run_in_browser(page, 1200, other)
     assert found["errors"] == []
     assert found["wide"] <= 0

@@ -1,0 +1,120 @@
+"""``calstudy which``: which calibration to trust on an array, by the experiment `which.yaml` with that array in it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from calstudy.base.errors import ExperimentError, InputError
+from calstudy.cli.options import MaxMemory, Scale, Set, Workers
+
+BEAMS = {"hera": "hera", "mwa": "mwa-embedded-element"}
+"""Beams of the antennas of sites."""
+FIELDS = (
+    (r"^instrument\.layout(\.path)?(?= =|:)", "LAYOUT"),
+    (r"^instrument\.location(\.\w+)?(?= =|:)", "--site"),
+    (r"^instrument\.beam(\.path)?(?= =|:)", "--beam"),
+    (r" \(in '[^']*'( and \d+ other cases?)?\)$", ""),
+)
+"""Fields in messages, and the options that set them; and the cases, because all have the same array."""
+
+Layout = Annotated[
+    str,
+    typer.Argument(
+        metavar="LAYOUT",
+        help="CSV file with columns east_m, north_m, up_m, or the name of a layout, such as hera-37.",
+        show_default=False,
+    ),
+]
+Site = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|LAT,LON", help="Where the array is: hera, mwa, ..., or degrees; by default the layout's own site."
+    ),
+]
+Beam = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|FILE", help="hera, airy, ..., a .beamfits file or a file.py; by default that of HERA or the MWA."
+    ),
+]
+Plan = Annotated[bool, typer.Option("--dry-run", help="Show what would be done, and stop.")]
+
+
+def which(
+    layout: Layout,
+    site: Site = None,
+    beam: Beam = None,
+    scale: Scale = None,
+    overrides: Set = None,
+    workers: Workers = None,
+    max_memory: MaxMemory = None,
+    dry_run: Plan = False,
+) -> None:
+    """Which calibration to trust on an array: simulate the standard calibrators in the standard worlds, and say.
+
+    The experiment is the published one, which: calstudy init --example which writes a copy, to be changed and run.
+    """
+    from calstudy.run.execution import Budget
+    from calstudy.studies.load import load_study
+    from calstudy.studies.show import describe_plan, show_plan, show_run
+    from calstudy.studies.study import run_study
+
+    changes = [*array_changes(layout, site, beam), *(overrides or ())]
+    console, budget = Console(soft_wrap=True, highlight=False), Budget(workers, max_memory)
+    try:
+        study = load_study(Path("which"), scale, changes)
+    except ExperimentError as error:
+        raise ExperimentError(list(dict.fromkeys(map(_in_options, error.faults)))) from None
+    except InputError as error:
+        raise InputError(_in_options(str(error))) from None
+    if dry_run:
+        show_plan(describe_plan(study, budget), console)
+        return
+    show_run(run_study(study, budget, console), console)
+
+
+def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
+    """Return the changes of the experiment, as of --set; raises InputError if the beam must be given.
+
+    Layout and beam may also be blocks in braces, as in an experiment file.
+    """
+    from calstudy.instrument.settings import LAYOUTS
+
+    changes = {"instrument.layout": _block(layout, "csv", (".csv",))}
+    if site is not None:
+        changes["instrument.location"] = _place(site)
+    if beam is None:
+        # The site of a block, or of a user's file, is not known here.
+        own = LAYOUTS.find(layout).site if re.fullmatch(r"[\w-]+", layout) else None
+        if (beam := BEAMS.get(site or own or "")) is None:
+            raise InputError(
+                "--beam: is needed, because the array is neither HERA's nor the MWA's: such as --beam airy"
+            )
+    changes["instrument.beam"] = _block(beam, "beamfits", (".beamfits", ".fits"))
+    return [f"{path}={value}" for path, value in changes.items()]
+
+
+def _block(text: str, kind: str, suffixes: tuple[str, ...]) -> str:
+    """Return what is a file here as a block of a kind or, if it is Python code, by its absolute path."""
+    if text.lower().endswith(suffixes):
+        return json.dumps({"kind": kind, "path": str(Path(text).resolve())})
+    is_code = text.endswith(".py") or ".py:" in text
+    return json.dumps(str(Path(text).resolve())) if is_code else text
+
+
+def _place(site: str) -> str:
+    """Return latitude and longitude as a block; a name, and what is neither, as it is."""
+    found = re.fullmatch(r"\s*([-+\d.]+)\s*,\s*([-+\d.]+)\s*", site)
+    return f"{{latitude: {found[1]} deg, longitude: {found[2]} deg}}" if found else site
+
+
+def _in_options(sentence: str) -> str:
+    for pattern, replacement in FIELDS:
+        sentence = re.sub(pattern, replacement, sentence)
+    return sentence
