@@ -7,6 +7,7 @@ that is, the relative change of the amplitude while it is small, and v that of t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -59,6 +60,7 @@ Shape = Annotated[Polynomial | Delays, choice("kind", "polynomial")]
 SECONDS_PER_DAY = 86400
 
 
+Antennas = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
 Channels = Annotated[Literal["common", "independent"] | Polynomial | Delays, choice("kind", "polynomial")]
 
 
@@ -80,6 +82,9 @@ class _Drift(Section, ABC):
         "the change, of which every component is a process of its own: `amplitude` and `phase` are then in the mean "
         "over the band.",
     )
+    antennas: Antennas = Field(
+        (), description="Antennas whose gains drift, counted from 0 in the order of the layout; empty: all."
+    )
     seed: int = Field(50, ge=0, description="Together with the seed of the effect.")
 
     def factors(self, observation: Observation, effect_seed: int) -> np.ndarray:
@@ -100,7 +105,9 @@ class _Drift(Section, ABC):
         if not isinstance(self.channels, str):
             processes = np.einsum("fc,xacpt->xafpt", components, processes, optimize=True)
         amplitude, phase = np.moveaxis(processes, -1, -2)
-        return np.exp(self.amplitude * amplitude + 1j * self.phase * phase)
+        factors = np.exp(self.amplitude * amplitude + 1j * self.phase * phase)
+        # Draws of an antenna do not depend on which others drift.
+        return factors if not self.antennas else np.where(is_named(self.antennas, observation), factors, 1)
 
     @abstractmethod
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -109,6 +116,19 @@ class _Drift(Section, ABC):
         `shape` is (2, Nants, Nfreqs or Ncomponents or 1, Npols); `seconds`, (Ntimes,), is the time since the first
         integration.
         """
+
+
+def is_named(antennas: Sequence[int], observation: Observation) -> np.ndarray:
+    """Return which antennas of an observation are named, by their place in the layout, bool, (Nants, 1, 1, 1)."""
+    numbers = np.asarray(observation.uvd.telescope.antenna_numbers)[list(antennas)]
+    return np.isin(observation.numbers, numbers)[:, None, None, None]
+
+
+def refusal_of_antennas(antennas: Sequence[int], count: int) -> str | None:
+    """Return why antennas cannot be named in an array of `count`, or None if they can."""
+    if antennas and max(antennas) >= count:
+        return f"names antenna {max(antennas)}, but there are {count} antennas, counted from 0"
+    return None
 
 
 class RandomWalk(_Drift):

@@ -12,7 +12,7 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.resources import Cost
-from calstudy.corrupt.drift import Drift
+from calstudy.corrupt.drift import Drift, refusal_of_antennas
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
@@ -103,6 +103,11 @@ class GainEffect(Effect):
     uses_positions: ClassVar[bool] = False
 
     drift: Drift | None = Field(None, description="How the gains change during the run; null: they are constant.")
+
+    def refusal(self, size: Size) -> str | None:
+        """Refuse a drift of antennas that do not exist."""
+        reason = None if self.drift is None else refusal_of_antennas(self.drift.antennas, size.antennas)
+        return None if reason is None else f"drift.antennas: {reason}"
 
     @abstractmethod
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:

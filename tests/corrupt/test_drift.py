@@ -16,9 +16,10 @@ from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices
 from calstudy.corrupt.drift import RandomWalk
 from calstudy.corrupt.effects.gains import FileGains, PerChannelGains
-from calstudy.corrupt.interface import Effect, apply_effect, draw_truth
+from calstudy.corrupt.interface import Effect, apply_effect, draw_truth, require_usable
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.experiment.files import override, validate
+from calstudy.instrument.layouts import size_of_instrument
 from calstudy.instrument.telescope import make_template
 from calstudy.products import agreement, corruption, signal_loss
 from calstudy.products.files import AGREEMENT, read_json
@@ -203,6 +204,53 @@ def test_a_drift_follows_both_seeds_and_every_effect_on_gains_can_have_one(obser
     other = drifted(observed, "reflection-gains", kind="random-walk", seed=1)
     # The same seeds, and another effect: the logarithm of the gains divided by themselves.
     assert other == pytest.approx(first, abs=1e-12)
+
+
+def test_only_named_antennas_drift_and_as_they_would_with_all_others(observed):
+    every = drifted(observed, kind="random-walk")
+    some = drifted(observed, kind="random-walk", antennas=[3, 7])
+    others = np.delete(some, [3, 7], axis=0)
+    assert others == pytest.approx(0, abs=1e-15)
+    assert some[[3, 7]] == pytest.approx(every[[3, 7]], abs=1e-12)
+    assert np.abs(some[[3, 7], :, 1:]).min() > 0
+
+
+def test_a_reflection_swings_in_delay_and_size_in_the_named_cables(observed):
+    block = {"kind": "reflection-gains", "amplitude": 0.05, "delay": "300 ns", "delay_scatter": "20 ns", "seed": 4}
+    swing = {"delay": "2 ns", "amplitude": 0.2, "period": "100 s", "antennas": [2]}
+    constant = draw_truth(Effect.registry.make(block), observed)["gains"]
+    moving = draw_truth(Effect.registry.make({**block, "swing": swing}), observed)["gains"]
+    assert constant.shape[2] == 1
+    expected = np.broadcast_to(np.delete(constant, 2, axis=0), np.delete(moving, 2, axis=0).shape)
+    np.testing.assert_allclose(np.delete(moving, 2, axis=0), expected, rtol=1e-13)
+    # 1/g - 1 is r exp(-i (2 pi nu tau + phi)): its modulus is r, and its phase over frequency has the slope -2 pi tau.
+    waves, still = 1 / moving[2, :, :, 0] - 1, 1 / constant[2, :, 0, 0] - 1
+    slope = 2 * np.pi * np.ptp(observed.frequencies)
+    turned = np.angle(waves[1:] / waves[:-1]).sum(axis=0) - np.angle(still[1:] / still[:-1]).sum()
+    # Julian dates are good to 40 microseconds.
+    seconds = 86400 * (observed.times - observed.times[0])
+    change = np.abs(waves).mean(axis=0) / np.abs(still).mean() - 1
+    basis = np.column_stack([np.sin(2 * np.pi * seconds / 100), np.cos(2 * np.pi * seconds / 100)])
+    for values, size in ((change, 0.2), (-turned / slope, 2e-9)):
+        found = np.linalg.lstsq(basis, values, rcond=None)[0]
+        np.testing.assert_allclose(basis @ found, values, atol=1e-9 * size + 1e-9 * np.abs(values).max())
+        assert np.hypot(*found) == pytest.approx(size, rel=1e-6)
+    # Both go together.
+    np.testing.assert_allclose(-turned / slope / 2e-9, change / 0.2, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("block", "field"),
+    [
+        ({"kind": "bandpass", "drift": {"kind": "jumps", "antennas": [99]}}, "drift"),
+        ({"kind": "coarse-channels", "drift": {"kind": "jumps", "antennas": [99]}}, "drift"),
+        ({"kind": "reflection-gains", "swing": {"delay": "1 ns", "antennas": [99]}}, "swing"),
+    ],
+)
+def test_changes_of_antennas_that_do_not_exist_are_refused(block, field):
+    size = size_of_instrument(small_instrument(channels={"count": 64, "width": "40 kHz"}))
+    with pytest.raises(InputError, match=rf"^corruption.effects.0.{field}.antennas: names antenna 99"):
+        require_usable([Effect.registry.make(block)], size)
 
 
 def test_two_drifts_with_the_same_seeds_are_refused():

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.units import Frequency
+from calstudy.corrupt.drift import Antennas, refusal_of_antennas
 from calstudy.corrupt.interface import Effect, Truth
 
 if TYPE_CHECKING:
@@ -83,9 +84,7 @@ class DeadAntennas(Effect):
     uses_positions: ClassVar[bool] = False
 
     kind: str = "dead-antennas"
-    antennas: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
-        (), description="Counted from 0 in the order of the layout; empty: `count` at random."
-    )
+    antennas: Antennas = Field((), description="Counted from 0 in the order of the layout; empty: `count` at random.")
     count: int = Field(1, ge=1, description="How many are drawn, where none are named.")
     seed: int = Field(12, ge=0, description="Seed of the choice of `count` antennas.")
 
@@ -95,8 +94,8 @@ class DeadAntennas(Effect):
 
     def _refusal(self, count: int) -> str | None:
         """Return why the effect cannot be applied to `count` antennas, or None."""
-        if self.antennas and max(self.antennas) >= count:
-            return f"antennas: names antenna {max(self.antennas)}, but there are {count} antennas, counted from 0"
+        if (reason := refusal_of_antennas(self.antennas, count)) is not None:
+            return f"antennas: {reason}"
         field, dead = ("antennas", len(set(self.antennas))) if self.antennas else ("count", self.count)
         if count - dead < LEAST:
             return (

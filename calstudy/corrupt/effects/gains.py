@@ -20,9 +20,10 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import gains_for, read_gains
-from calstudy.base.units import Delay, Fraction, Frequency
+from calstudy.base.schema import Section
+from calstudy.base.units import Delay, Fraction, Frequency, Time
 from calstudy.base.visibilities import antenna_rows
-from calstudy.corrupt.drift import Polynomial, Shape
+from calstudy.corrupt.drift import SECONDS_PER_DAY, Antennas, Polynomial, Shape, is_named, refusal_of_antennas
 from calstudy.corrupt.interface import GainEffect
 
 if TYPE_CHECKING:
@@ -71,31 +72,60 @@ class Bandpass(GainEffect):
         return np.moveaxis(1 + self.sigma * (real + 1j * imaginary), 2, 1)[:, :, None]
 
 
+class Swing(Section):
+    """A sinusoidal change of a reflection, as by the temperature of a cable, with a random start for every antenna."""
+
+    delay: Delay = Field(0.0, ge=0, description="Amplitude of the change of the delay.")
+    amplitude: Fraction = Field(0.0, ge=0, lt=1, description="Amplitude of the relative change of r.")
+    period: Time = Field(3600.0, gt=0, description="Duration of one oscillation.")
+    antennas: Antennas = Field(
+        (), description="Antennas whose reflections change, counted from 0 in the order of the layout; empty: all."
+    )
+
+    def at(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
+        """Return the change in units of its amplitude, (Npols, Nants, 1, Ntimes); zero for other antennas."""
+        start = random.uniform(0, 2 * np.pi, (observation.n_polarizations, observation.n_antennas, 1, 1))
+        seconds = (observation.times - observation.times[0]) * SECONDS_PER_DAY
+        change = np.sin(2 * np.pi * seconds / self.period + start)
+        return change if not self.antennas else change * is_named(self.antennas, observation)[..., 0]
+
+
 class ReflectionGains(GainEffect):
-    """One cable reflection per antenna: r exponential, tau normal, phi uniform (paper Eq. REFGAIN, §Low SNR)."""
+    """One cable reflection per antenna: r exponential, tau normal, phi uniform (paper Eq. REFGAIN, §Low SNR).
+
+    A cable with several reflections has one effect for each, with different seeds.
+    """
 
     kind: str = "reflection-gains"
     amplitude: float = Field(0.01, ge=0, lt=1, description="Mean of the exponential distribution of r.")
     delay: Delay = Field(1200e-9, description="Mean of the normal distribution of the delay.")
     delay_scatter: Delay = Field(100e-9, ge=0, description="Standard deviation of that distribution.")
+    swing: Swing | None = Field(None, description="How delay and r change during the run; null: they are constant.")
     seed: int = Field(5, ge=0, description="Seed of r, tau and phi.")
 
+    def refusal(self, size: Size) -> str | None:
+        """Refuse changes of antennas that do not exist."""
+        reason = None if self.swing is None else refusal_of_antennas(self.swing.antennas, size.antennas)
+        return super().refusal(size) if reason is None else f"swing.antennas: {reason}"
+
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
-        """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization.
+        """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols), with an independent draw for every polarization.
 
         Raise InputError if a drawn amplitude is not below one: such a reflection does not decay.
         """
-        shape = (observation.n_polarizations, observation.n_antennas)
+        shape = (observation.n_polarizations, observation.n_antennas, 1, 1)
         amplitudes = random.exponential(self.amplitude, shape)
         delays = random.normal(self.delay, self.delay_scatter, shape)
         phases = random.uniform(0, 2 * np.pi, shape)
+        if self.swing is not None:
+            change = self.swing.at(observation, random)
+            amplitudes, delays = amplitudes * (1 + self.swing.amplitude * change), delays + self.swing.delay * change
         if amplitudes.max() >= 1:
             raise InputError(
                 f"corruption.effects: amplitude = {self.amplitude}: drew a reflection of {amplitudes.max():.2f}, which "
                 "must stay below 1; use a smaller mean"
             )
-        gains = reflection_gain(observation.frequencies, amplitudes[..., None], delays[..., None], phases[..., None])
-        return gains.transpose(1, 2, 0)[:, :, None]
+        return np.moveaxis(reflection_gain(observation.frequencies[:, None], amplitudes, delays, phases), 0, -1)
 
 
 def reflection_gain(
@@ -176,7 +206,7 @@ class CoarseChannels(GainEffect):
         held = self.width / size.channels.width
         # Frequencies are good to 1 Hz.
         if held > FEWEST * (1 - 1 / self.width):
-            return None
+            return super().refusal(size)
         return (
             f"width: {self.width / 1e6:g} MHz: a coarse channel holds {held:.2g} channels of "
             f"{size.channels.width / 1e6:g} MHz; its passband takes at least {FEWEST}"
