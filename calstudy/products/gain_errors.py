@@ -60,7 +60,7 @@ def observed_gain_errors(graph: MeasuredGraph, part: str) -> Task:
     )
 
 
-class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
+class ErrorsOfGains(Calibrated, stage="gain-errors", version=2):
     """The gains of a calibration with their errors."""
 
     calibration: Input
@@ -129,7 +129,9 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
 
         size = size_of(self)
         matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
-        return Cost(5 + 1e-5 * size.samples, LIBRARIES_MEMORY + 3 * matrix + 4 * size.samples * COMPLEX128, 1e6)
+        blocks = size.antennas * (2 * size.channels.count) ** 2 * COMPLEX128 / 2
+        memory = LIBRARIES_MEMORY + 3 * matrix + blocks + 4 * size.samples * COMPLEX128
+        return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
 def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> list[str]:
