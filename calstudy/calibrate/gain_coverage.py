@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
-from calstudy.calibrate.gain_errors import GainErrors
+
+if TYPE_CHECKING:
+    from calstudy.calibrate.gain_errors import GainErrors
 
 EXPECTED = np.arange(1, 100) / 100
 """Fractions of a normal distribution within limits around zero, with which those of the deviations are compared."""

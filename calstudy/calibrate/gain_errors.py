@@ -153,11 +153,13 @@ def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:
 
     These are (Nfreqs, Nsmooth), or None for all that it has.
     """
-    found = []
+    known: dict[bytes, np.ndarray] = {}
     for used in has_data:
+        if used.tobytes() in known:
+            continue
         span = np.eye(len(used))[:, used]
         if smooth is not None and used.any():
             left, singular, _ = np.linalg.svd(smooth[used])
             span = span @ left[:, np.count_nonzero(singular > SPAN_CUTOFF) :]
-        found.append(span)
-    return found
+        known[used.tobytes()] = span
+    return [known[used.tobytes()] for used in has_data]

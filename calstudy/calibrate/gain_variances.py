@@ -132,10 +132,10 @@ def _blocks(
 ) -> list[np.ndarray]:
     """Return the block of H of each antenna, with the sums of |slope|^2 of its baselines, (Nants, Nfreqs)."""
     found = [np.kron(np.eye(2), (span.T * power) @ span) for span, power in zip(spans, degrees, strict=True)]
-    for touched, absorbed in _absorbed(tangent, antennas):
-        for antenna, change in zip(touched, absorbed, strict=True):
-            columns = np.concatenate([spans[antenna].T @ part for part in pair(change)])
-            found[antenna] -= columns @ columns.T
+    for absorbed in _absorbed(tangent, antennas):
+        for item in absorbed:
+            columns = item.columns(spans[item.antenna])
+            found[item.antenna] -= columns @ columns.T
     return found
 
 
@@ -163,39 +163,60 @@ def _curvature(tangent: TangentSpace, antennas: np.ndarray, spans: list[np.ndarr
             block = (spans[ends[a]] * power[:, None]).T @ spans[ends[b]]
             for part, sign in ((0, 1), (size, 1 if a == b else -1)):
                 matrix[np.ix_(part + places[ends[a]], part + places[ends[b]])] += sign * block
-    for touched, found in _absorbed(tangent, antennas):
-        parts = [zip(touched, part, strict=True) for part in pair(found)]
-        columns = np.concatenate([spans[antenna].T @ change for part in parts for antenna, change in part])
-        rows = np.concatenate([places[antenna] for antenna in touched])
-        rows = np.concatenate([rows, size + rows])
+    for absorbed in _absorbed(tangent, antennas):
+        columns = np.concatenate([item.columns(spans[item.antenna]) for item in absorbed])
+        rows = np.concatenate([part + places[item.antenna] for item in absorbed for part in (0, size)])
         matrix[np.ix_(rows, rows)] -= columns @ columns.T
     return matrix
 
 
-def _absorbed(tangent: TangentSpace, antennas: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the antennas and the columns of what foregrounds take from H; see `_pulled`."""
+def _absorbed(tangent: TangentSpace, antennas: np.ndarray) -> Iterator[list[Absorbed]]:
+    """Yield what foregrounds of some baselines take from H, for one after the other."""
     for response in tangent.responses:
         yield _pulled(tangent, antennas, response.members, response.common)
         for place, own in enumerate(() if response.own is None else response.own):
             yield _pulled(tangent, antennas, response.members[place : place + 1], own[None])
 
 
-def _pulled(
-    tangent: TangentSpace, antennas: np.ndarray, members: np.ndarray, sequences: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the antennas of some baselines, and J^T q for sequences q of these, (Nmembers, Nfreqs, Nvec).
+class Absorbed(NamedTuple):
+    """J^T q on one antenna, complex, (Nfreqs, Nvec), for sequences q: `along` + `against`.
 
-    J^T q is complex, (Nantennas, Nfreqs, 2 Nvec), for q and i q.
+    For i q it is i (`along` - `against`), because the second antenna of a baseline has the conjugate.
     """
-    touched = np.unique(antennas[members])
-    both = np.concatenate([sequences, 1j * sequences], axis=2)
-    both = np.where(tangent.conjugated[members][:, None, None], both.conj(), both)
-    gradient = tangent.slope[members].conj()[:, :, None] * both
-    found = np.zeros((touched.size, *both.shape[1:]), complex)
-    first, second = np.searchsorted(touched, antennas[members]).T
-    np.add.at(found, first, gradient)
-    np.add.at(found, second, gradient.conj())
-    return touched, found
+
+    antenna: int
+    along: np.ndarray | None
+    against: np.ndarray | None
+
+    def columns(self, span: np.ndarray) -> np.ndarray:
+        """Return J^T q, then J^T i q, within a span (Nfreqs, N): real parts above imaginary ones, (2 N, 2 Nvec)."""
+        along, against = (None if part is None else _within(span, part) for part in (self.along, self.against))
+        if along is not None and against is not None:
+            both = np.concatenate([along + against, 1j * (along - against)], axis=1)
+        elif along is not None:
+            both = np.concatenate([along, 1j * along], axis=1)
+        else:
+            assert against is not None
+            both = np.concatenate([against, -1j * against], axis=1)
+        return np.concatenate([both.real, both.imag])
+
+
+def _within(span: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return span^T part of a complex part, as one product of real matrices."""
+    return (span.T @ np.ascontiguousarray(part).view(float)).view(complex)
+
+
+def _pulled(tangent: TangentSpace, antennas: np.ndarray, members: np.ndarray, sequences: np.ndarray) -> list[Absorbed]:
+    """Return J^T q on each antenna of some baselines for sequences q of these, real, (Nmembers, Nfreqs, Nvec)."""
+    found: dict[int, list[np.ndarray | None]] = {}
+    for member, own in zip(members, sequences, strict=True):
+        gradient = tangent.slope[member].conj()[:, None] * own
+        for side, antenna in enumerate(antennas[member].tolist()):
+            parts = found.setdefault(antenna, [None, None])
+            place, turned = int(side != tangent.conjugated[member]), gradient.conj() if side else gradient
+            before = parts[place]
+            parts[place] = turned if before is None else before + turned
+    return [Absorbed(antenna, *parts) for antenna, parts in found.items()]
 
 
 def pair(values: np.ndarray) -> np.ndarray:
