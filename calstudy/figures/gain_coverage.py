@@ -111,7 +111,10 @@ def _draw_fractions(axes: Axes, member: Covered) -> None:
     found = "\n".join(
         f"{name}: {100 * one:.1f}, {100 * two:.1f} %" for name, (one, two) in zip(PARTS, member.within, strict=True)
     )
-    axes.text(0.96, 0.06, f"within 1 and 1.96 σ\n{found}", ha="right", fontsize=style.SMALL_SIZE)
+    # On the side of the diagonal where there are no curves.
+    above = bool(np.mean(member.observed - member.expected) < 0)
+    place: dict[str, Any] = {"x": 0.04, "y": 0.94, "va": "top"} if above else {"x": 0.96, "y": 0.06, "ha": "right"}
+    axes.text(s=f"within 1 and 1.96 σ\n{found}", fontsize=style.SMALL_SIZE, **place)
     axes.set(xlim=(0, 1), ylim=(0, 1))
 
 

@@ -36,7 +36,7 @@ class GainErrors(Step):
         f"{part}_{name}": Limit(
             f"fraction of the {part}s of all gains within {sigmas} sigma",
             Within(right - allowed, right + allowed),
-            f"{100 * right:.3g} % of a normal distribution, and errors that are 7 % too small or too large",
+            f"{100 * right:.3g} % of a normal distribution; errors that are 7 % too small or too large fail",
         )
         for part in PARTS
         for name, sigmas, (right, allowed) in zip(NAMES, ("1", "1.96"), ALLOWED, strict=True)
