@@ -88,7 +88,7 @@ def test_pooling_weights_by_inverse_variance():
 @pytest.mark.parametrize("scale", SCALES)
 def test_all_steps_load_and_have_what_the_table_needs(scale):
     steps = [step for step, _ in load_ladder(scale=scale).steps]
-    assert len(steps) == 12
+    assert len(steps) == 13
     for step in steps:
         assert step.statements()
         assert all(item.why and item.quantity and item.sentence for item in step.statements())
