@@ -135,7 +135,7 @@ def _draw_difference(axes: Axes, member: Covered) -> None:
 
 def _error(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     parent, _, own = name.rpartition(".")
-    return arrays[f"{parent}.{'error' if own == 'observed' else 'within_error'}".lstrip(".")]
+    return arrays[f"{parent}.{'error' if own in ('observed', 'error') else 'within_error'}".lstrip(".")]
 
 
 class GainCoverageFigure(StudyFigure):

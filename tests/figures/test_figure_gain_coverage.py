@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import re
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,11 @@ from tiny import tiny
 
 from calstudy.calibrate.gain_coverage import EXPECTED, GainCoverage
 from calstudy.experiment.files import override, validate
-from calstudy.figures.gain_coverage import ALLOWED, draw_gain_coverage, pooled
+from calstudy.figures.gain_coverage import ALLOWED, GainCoverageFigure, draw_gain_coverage, pooled
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, run_study
+from calstudy.verdicts.tolerances import Drawn
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
@@ -65,6 +68,15 @@ def test_a_run_of_a_known_sky_is_covered(tmp_path):
     assert [row[:3] for row in rows] == [["", "amplitude", "8"], ["", "phase", "8"]]
     for name, (right, allowed) in zip(("within 1 sigma [%]", "within 1.96 sigma [%]"), ALLOWED, strict=True):
         assert [float(row[head.index(name)]) for row in rows] == pytest.approx([100 * right] * 2, abs=100 * allowed)
+
+
+@pytest.mark.parametrize("prefix", ["", "calamity."])
+def test_every_array_has_a_tolerance_of_its_shape(prefix):
+    arrays = {f"{prefix}{name}": np.asarray(value) for name, value in asdict(pooled([coverage(1)])).items()}
+    for name, values in arrays.items():
+        rule = next(rule for pattern, rule in GainCoverageFigure.tolerances if re.fullmatch(pattern, name))
+        if isinstance(rule, Drawn):
+            assert rule.error(arrays, name).shape == values.shape
 
 
 def test_gains_need_a_fit_and_noise():
