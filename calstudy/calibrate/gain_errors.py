@@ -35,24 +35,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from calstudy.calibrate.basis import gain_vectors
+from calstudy.calibrate.gain_variances import Alignment, as_a_whole, by_antenna, by_channel, pair
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 from calstudy.calibrate.tangent_space import SPAN_CUTOFF, TangentSpace
 
 ORDERS = 3
 """Powers of a smooth change of the gains that are larger than the noise."""
-RESOLVED = 1e-9
-"""Added to eigenvalues of H relative to its diagonal. Directions with less, as of two arrays without a baseline between
-them, get enormous errors."""
-AT_ONCE = 2**20
-"""Elements of the matrices of several channels that are inverted together."""
 MOST_UNKNOWNS = 2048
-"""Largest number of real unknowns, besides smooth ones, whose matrix is inverted."""
+"""Largest number of real unknowns, besides smooth ones, whose matrix is inverted as a whole."""
 NoiseFrom = Literal["weights", "residual"]
 
 
@@ -114,7 +109,7 @@ def gain_errors(
     if structure.gain_vectors is not None:
         return "the gains are restricted to smooth functions, whose errors are not known"
     tangent, has_data = TangentSpace.at(problem, gains, model), problem.antenna_weights > 0
-    alignment = _Alignment.at(problem, gains, has_data)
+    alignment = Alignment.at(problem, gains, has_data)
     degrees = 2 * (np.count_nonzero(problem.weights) - np.count_nonzero(has_data)) + alignment.n_aligned
     degrees -= sum(2 * response.sequences.shape[2] for response in tangent.responses)
     if not tangent.finite and degrees < 1:
@@ -125,15 +120,11 @@ def gain_errors(
     if not any(span.size for span in spans):
         return f"foregrounds can follow gains up to delays of {delay * 1e9:.0f} ns, and the channels resolve no others"
     unknowns = 2 * sum(span.shape[1] for span in spans)
-    if not problem.frozen and unknowns > MOST_UNKNOWNS:
-        return (
-            f"{structure.n_antennas} antennas in {structure.n_frequencies} channels have {unknowns} unknowns, and "
-            f"errors of gains that are fitted with foregrounds are known for {MOST_UNKNOWNS} at most"
-        )
     if problem.frozen:
-        variances = _by_channel(tangent, structure.antennas, alignment)
+        variances = by_channel(tangent, structure.antennas, alignment)
     else:
-        variances = _with_foregrounds(tangent, structure.antennas, alignment, spans)
+        invert = as_a_whole if unknowns <= MOST_UNKNOWNS else by_antenna
+        variances = invert(tangent, structure.antennas, alignment, spans)
     residual = problem.visibilities - gain_products(gains, structure.antennas) * model
     powers = np.sum(problem.weights * np.abs(residual) ** 2, axis=0)
     loss, powers = float(np.sum(powers)), powers[has_data.any(axis=0)]
@@ -141,7 +132,8 @@ def gain_errors(
 
     def determined(change: np.ndarray) -> np.ndarray:
         kept = np.stack([span @ (span.T @ row) for span, row in zip(spans, change, strict=True)])
-        return _complex(alignment.align(_pair(kept)))
+        real, imaginary = alignment.align(pair(kept))
+        return real + 1j * imaginary
 
     return GainErrors(
         np.abs(gains) * sigma[0],
@@ -156,145 +148,18 @@ def gain_errors(
     )
 
 
-class _Alignment(NamedTuple):
-    """The alignment of a change: |g|^2 over its sum over antennas, (Nants, Nfreqs), and over that over channels too.
-
-    The latter is None where data determine the scale. `n_aligned` is the number of numbers that are aligned.
-    """
-
-    of_channel: np.ndarray
-    of_all: np.ndarray | None
-    n_aligned: int
-
-    @classmethod
-    def at(cls, problem: CalibrationProblem, gains: np.ndarray, has_data: np.ndarray) -> _Alignment:
-        """Return the alignment of gains (Nants, Nfreqs) where they have data."""
-        power = np.where(has_data, np.abs(gains) ** 2, 0)
-        total = power.sum(axis=0)
-        known = problem.frozen or (problem.prior == "none" and problem.structure.prior != "none")
-        of_channel = power / np.where(total > 0, total, 1)
-        return cls(of_channel, None if known else power / power.sum(), int((total > 0).sum()) + (not known))
-
-    def align(self, change: np.ndarray) -> np.ndarray:
-        """Take the phase of each channel and the scale out of changes (2, Nants, Nfreqs, ...), real and imaginary."""
-        real, imaginary = change
-        imaginary = imaginary - np.einsum("af,af...->f...", self.of_channel, imaginary)
-        if self.of_all is not None:
-            real = real - np.einsum("af,af...->...", self.of_all, real)
-        return np.stack([real, imaginary])
-
-
 def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:
     """Return an orthonormal basis, (Nfreqs, N), of what each antenna has in channels with data beside smooth sequences.
 
     These are (Nfreqs, Nsmooth), or None for all that it has.
     """
-    found = []
+    known: dict[bytes, np.ndarray] = {}
     for used in has_data:
+        if used.tobytes() in known:
+            continue
         span = np.eye(len(used))[:, used]
         if smooth is not None and used.any():
             left, singular, _ = np.linalg.svd(smooth[used])
             span = span @ left[:, np.count_nonzero(singular > SPAN_CUTOFF) :]
-        found.append(span)
-    return found
-
-
-def _by_channel(tangent: TangentSpace, antennas: np.ndarray, alignment: _Alignment) -> np.ndarray:
-    """Return the diagonal of H^-1 for known foregrounds, which couple neither channels nor amplitudes and phases."""
-    power, shares = np.abs(tangent.slope) ** 2, alignment.of_channel
-    found, n_antennas = np.empty((2, *shares.shape)), len(shares)
-    step = max(1, AT_ONCE // n_antennas**2)
-    for start in range(0, shares.shape[1], step):
-        channels = slice(start, start + step)
-        rows = shares[:, channels].T[:, None, :]
-        # The difference of two phases and the sum of two amplitudes: the graph's Laplacian, and that without signs.
-        matrices = np.zeros((2, n_antennas, n_antennas, len(rows)))
-        for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            for part, sign in enumerate((1, 1 if a == b else -1)):
-                np.add.at(matrices[part], (antennas[:, a], antennas[:, b]), sign * power[:, channels])
-        scaled, scale = _scaled(np.moveaxis(matrices, 3, 1))
-        # The common phase, which no data determine, and which the alignment removes.
-        common = np.sqrt(np.einsum("faa->fa", scale[1]))
-        scaled[1] += common[:, :, None] * common[:, None, :] / np.maximum(np.sum(common**2, axis=1), 1)[:, None, None]
-        inverse = np.linalg.inv(scaled) / scale
-        phases = inverse[1] - rows @ inverse[1]
-        inverse[1] = phases - phases @ np.swapaxes(rows, 1, 2)
-        found[:, :, channels] = np.einsum("cfaa->caf", inverse)
-    return np.maximum(found, 0)
-
-
-def _with_foregrounds(
-    tangent: TangentSpace, antennas: np.ndarray, alignment: _Alignment, spans: list[np.ndarray]
-) -> np.ndarray:
-    """Return the diagonal of H^-1 within the spans, (2, Nants, Nfreqs)."""
-    from scipy.linalg import solve_triangular
-
-    shape, edges = (2, *alignment.of_channel.shape), np.cumsum([0, *(span.shape[1] for span in spans)])
-    matrix, whole = _curvature(tangent, antennas, spans), np.zeros((*shape, 2 * edges[-1]))
-    for part, offset in enumerate((0, edges[-1])):
-        for antenna, span in enumerate(spans):
-            whole[part, antenna, :, offset + edges[antenna] : offset + edges[antenna + 1]] = span
-    aligned = alignment.align(whole)
-    scaled, scale = _scaled(matrix)
-    rows = aligned.reshape(-1, len(matrix)) / np.sqrt(np.diag(scale))
-    half = solve_triangular(np.linalg.cholesky(scaled), rows.T, lower=True, check_finite=False)
-    return np.sum(half**2, axis=0).reshape(shape)
-
-
-def _scaled(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrices (..., n, n) with a unit diagonal and no negative eigenvalue, and by what they were divided."""
-    diagonal = np.einsum("...aa->...a", matrices)
-    roots = np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    scale = roots[..., :, None] * roots[..., None, :]
-    return matrices / scale + RESOLVED * np.eye(matrices.shape[-1]), scale
-
-
-def _curvature(tangent: TangentSpace, antennas: np.ndarray, spans: list[np.ndarray]) -> np.ndarray:
-    """Return H of the coefficients of the spans, (n, n): of Re of all antennas, then Im."""
-    widths = [span.shape[1] for span in spans]
-    size, edges = sum(widths), np.cumsum([0, *widths])
-    places = [np.arange(*ends) for ends in pairwise(edges)]
-    matrix = np.zeros((2 * size, 2 * size))
-    for pair, power in zip(antennas, np.abs(tangent.slope) ** 2, strict=True):
-        for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            block = (spans[pair[a]] * power[:, None]).T @ spans[pair[b]]
-            for part, sign in ((0, 1), (size, 1 if a == b else -1)):
-                matrix[np.ix_(part + places[pair[a]], part + places[pair[b]])] += sign * block
-    for response in tangent.responses:
-        absorbed = [(response.members, response.common)]
-        if response.own is not None:
-            absorbed += [(response.members[p : p + 1], own[None]) for p, own in enumerate(response.own)]
-        for members, sequences in absorbed:
-            touched, found = _pulled(tangent, antennas, members, sequences)
-            parts = [zip(touched, part, strict=True) for part in _pair(found)]
-            columns = np.concatenate([spans[antenna].T @ change for part in parts for antenna, change in part])
-            rows = np.concatenate([places[antenna] for antenna in touched])
-            rows = np.concatenate([rows, size + rows])
-            matrix[np.ix_(rows, rows)] -= columns @ columns.T
-    return matrix
-
-
-def _pulled(
-    tangent: TangentSpace, antennas: np.ndarray, members: np.ndarray, sequences: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the antennas of some baselines, and J^T q for sequences q of these, (Nmembers, Nfreqs, Nvec).
-
-    J^T q is complex, (Nantennas, Nfreqs, 2 Nvec), for q and i q.
-    """
-    touched = np.unique(antennas[members])
-    both = np.concatenate([sequences, 1j * sequences], axis=2)
-    both = np.where(tangent.conjugated[members][:, None, None], both.conj(), both)
-    gradient = tangent.slope[members].conj()[:, :, None] * both
-    found = np.zeros((touched.size, *both.shape[1:]), complex)
-    first, second = np.searchsorted(touched, antennas[members]).T
-    np.add.at(found, first, gradient)
-    np.add.at(found, second, gradient.conj())
-    return touched, found
-
-
-def _pair(values: np.ndarray) -> np.ndarray:
-    return np.stack([values.real, values.imag])
-
-
-def _complex(values: np.ndarray) -> np.ndarray:
-    return values[0] + 1j * values[1]
+        known[used.tobytes()] = span
+    return [known[used.tobytes()] for used in has_data]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import positions
@@ -34,16 +34,35 @@ RAN_AWAY = "the weights, from the gains, do not settle: the gains are lost in no
 REMEDY = "solve more integrations together (integrations_per_solve), or smooth the gains (smooth_gains)"
 
 
+class SolvedGains(NamedTuple):
+    """The gains of a solve, with their errors or the reason why there are none.
+
+    Attributes
+    ----------
+    rows, times, place : antennas, integrations and polarization in the gains of the calibration
+    gains : complex, (Nants, Nfreqs)
+    """
+
+    rows: np.ndarray
+    times: slice
+    place: int
+    gains: np.ndarray
+    errors: GainErrors | str
+
+
 @memoize
 def gain_errors(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of the errors of the gains of a calibration of simulated data."""
-    inputs: dict[str, Any] = {**calibration.calibration_inputs(graph, variant, parity)}
-    return ErrorsOfGains(
-        LABEL,
-        calibration=calibration.calibration(graph, variant, parity),
-        calibrator=graph.experiment.calibration.with_defaults("assumed"),
-        **inputs,
-    )
+    return ErrorsOfGains(LABEL, **solved(graph, variant, parity))
+
+
+def solved(graph: Graph, variant: Variant, parity: str) -> dict[str, Any]:
+    """Return the fields of `OfSolves` for one noise realization ("even" or "odd") of a variant."""
+    return {
+        "calibration": calibration.calibration(graph, variant, parity),
+        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
+        **calibration.calibration_inputs(graph, variant, parity),
+    }
 
 
 @memoize
@@ -60,32 +79,14 @@ def observed_gain_errors(graph: MeasuredGraph, part: str) -> Task:
     )
 
 
-class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
-    """The gains of a calibration with their errors."""
+class OfSolves(Calibrated):
+    """What is made of the errors of the gains of every solve of a calibration."""
 
     calibration: Input
     calibrator: Calibrator = called("calibration")
 
-    def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the gains with their errors, and a record for each solve."""
-        import numpy as np
-
-        from calstudy.base.gains import write_gain_errors
-
-        result = read_result(self.calibration)
-        errors = np.full((2, *result.gains.gain_array.shape), np.nan)
-        records = self.fill(errors, result)
-        result.gains.write_calh5(output / GAINS)
-        if np.isfinite(errors).any():
-            write_gain_errors(output / GAINS, *errors)
-        write_json(output / ERRORS, {"records": records})
-        lost = sum(record.get("reason") == RAN_AWAY for record in records)
-        warnings = [f"{lost} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if lost else []
-        unevenness = max((record["unevenness"] for record in records if "reason" not in record), default=1.0)
-        return {"warnings": warnings + lost_in_noise(result.gains.gain_array, errors[0], unevenness)}
-
-    def fill(self, errors: np.ndarray, result: CalibrationResult) -> list[dict[str, Any]]:
-        """Fill in errors of amplitudes and phases, (2, Nants, Nfreqs, Ntimes, Npols), and return a record by solve."""
+    def solves(self, result: CalibrationResult) -> Iterator[SolvedGains]:
+        """Yield the gains of every solve with their errors."""
         import numpy as np
 
         from calstudy.base.visibilities import to_cube
@@ -93,13 +94,15 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
         from calstudy.calibrate.preparation import problem_at
 
         settings = self.calibrator
-        if not isinstance(settings, GainFit):
-            return [{"reason": f"{settings.label} is no fit by least squares"}] * len(result.solutions)
-        if settings.smooth_gains is not None:
-            return [{"reason": "the gains were smoothed after the fit"}] * len(result.solutions)
+        rows, nothing = np.arange(len(result.gains.ant_array)), np.zeros(0)
+        if not isinstance(settings, GainFit) or settings.smooth_gains is not None:
+            smoothed = "the gains were smoothed after the fit"
+            reason = smoothed if isinstance(settings, GainFit) else f"{settings.label} is no fit by least squares"
+            yield from (SolvedGains(rows, slice(0), 0, nothing, reason) for _ in result.solutions)
+            return
         # The solution is known, and a start of its own would cost more than the errors.
         settings = settings.model_copy(update={"initial_gains": UnityStart()})
-        prepared, cube, records = prepared_fit(settings, *self.read()), to_cube(result.model), []
+        prepared, cube = prepared_fit(settings, *self.read()), to_cube(result.model)
         rows = positions(result.gains.ant_array, prepared.data.numbers)
         for solve in result.solutions:
             times = slice(solve.integration, solve.integration + solve.n_integrations)
@@ -117,19 +120,45 @@ class ErrorsOfGains(Calibrated, stage="gain-errors", version=1):
             else:
                 model = cube[times, :, :, place].reshape(problem.visibilities.shape)
                 found = errors_of(problem, gains, model, prepared.data.frequencies)
-            if isinstance(found, str):
-                records.append({"reason": found})
-                continue
-            errors[..., place][:, rows, :, times] = np.stack([found.amplitude, found.phase])[..., None]
-            records.append(found.summary(gains))
-        return records
+            yield SolvedGains(rows, times, place, gains, found)
 
     def _cost(self) -> Cost:
         from calstudy.calibrate.gain_errors import MOST_UNKNOWNS
 
         size = size_of(self)
         matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
-        return Cost(5 + 1e-5 * size.samples, LIBRARIES_MEMORY + 3 * matrix + 4 * size.samples * COMPLEX128, 1e6)
+        blocks = size.antennas * (2 * size.channels.count) ** 2 * COMPLEX128 / 2
+        memory = LIBRARIES_MEMORY + 3 * matrix + blocks + 4 * size.samples * COMPLEX128
+        return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
+
+
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=2):
+    """The gains of a calibration with their errors."""
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the gains with their errors, and a record for each solve."""
+        import numpy as np
+
+        from calstudy.base.gains import write_gain_errors
+
+        result = read_result(self.calibration)
+        errors = np.full((2, *result.gains.gain_array.shape), np.nan)
+        records: list[dict[str, Any]] = []
+        for solve in self.solves(result):
+            if isinstance(solve.errors, str):
+                records.append({"reason": solve.errors})
+                continue
+            found = np.stack([solve.errors.amplitude, solve.errors.phase])
+            errors[..., solve.place][:, solve.rows, :, solve.times] = found[..., None]
+            records.append(solve.errors.summary(solve.gains))
+        result.gains.write_calh5(output / GAINS)
+        if np.isfinite(errors).any():
+            write_gain_errors(output / GAINS, *errors)
+        write_json(output / ERRORS, {"records": records})
+        lost = sum(record.get("reason") == RAN_AWAY for record in records)
+        warnings = [f"{lost} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if lost else []
+        unevenness = max((record["unevenness"] for record in records if "reason" not in record), default=1.0)
+        return {"warnings": warnings + lost_in_noise(result.gains.gain_array, errors[0], unevenness)}
 
 
 def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> list[str]:

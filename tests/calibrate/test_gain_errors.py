@@ -67,12 +67,8 @@ def structure_of(kind, toy):
     return replace(FitStructure.per_baseline(toy.antennas, len(toy.positions), basis), prior="own")
 
 
-def pulls(toy=SEVEN, kind="sky", noise=0.01, flagged=False, received=False, wrong=1.0):
-    """Return deviations over errors, (Nrealizations, 2, Nants, Nfreqs), of amplitudes and phases.
-
-    Noise is relative to the rms of the foregrounds, and multiplied by the gains if it is `received` with them.
-    Foregrounds deviate from the prior's mean by `wrong` times the prior's deviation.
-    """
+def parts_of(toy, kind, noise, flagged):
+    """Return the structure of a fit, the foregrounds and their rms, and weights and what else is known."""
     structure = structure_of(kind, toy)
     sky = np.where((structure.antennas != toy.antennas).any(axis=1)[:, None], toy.foregrounds.conj(), toy.foregrounds)
     if kind in ("calamity", "redundant"):
@@ -83,13 +79,23 @@ def pulls(toy=SEVEN, kind="sky", noise=0.01, flagged=False, received=False, wron
     if kind == "prior":
         weights = np.where(weights > 0, (noise * rms) ** -2, 0)
         known = {"sky_model": sky, "deviations": (DEVIATION * rms, np.inf), "prior": "none"}
+    return structure, sky, rms, {"weights": weights, **known}
+
+
+def pulls(toy=SEVEN, kind="sky", noise=0.01, flagged=False, received=False, wrong=1.0):
+    """Return deviations over errors, (Nrealizations, 2, Nants, Nfreqs), of amplitudes and phases.
+
+    Noise is relative to the rms of the foregrounds, and multiplied by the gains if it is `received` with them.
+    Foregrounds deviate from the prior's mean by `wrong` times the prior's deviation.
+    """
+    structure, sky, rms, known = parts_of(toy, kind, noise, flagged)
     products, found = gain_products(toy.gains, structure.antennas), []
     for number in range(REALIZATIONS):
         rng = np.random.default_rng([5, number])
         drawn = noise * rms * complex_normal(rng, sky.shape)
         truth = sky + (wrong * DEVIATION * rms * draw_in_basis(structure, rng) if kind == "prior" else 0)
         data = products * (truth + drawn) if received else products * truth + drawn
-        problem = toy.problem(structure, visibilities=data, weights=weights, **known)
+        problem = toy.problem(structure, visibilities=data, **known)
         if received:
             # The weights of the first fit's gains, as of a second pass.
             problem = problem.weighted_by(solve(problem, GaussNewton()).gains)
@@ -151,6 +157,36 @@ def test_errors_cover_the_scatter_of_noise(toy, settings):
 def test_errors_are_too_small_where_the_page_says_so(toy, settings, part):
     """Few antennas with flags, the edges of the band, noise that the weights do not follow, and second orders."""
     assert covered(pulls(toy, **settings)[part])[0] < RIGHT[0] - 0.05
+
+
+@pytest.mark.parametrize(
+    ("toy", "kind", "flagged"),
+    [
+        (SEVEN, "calamity", False),
+        (SEVEN, "redundant", False),
+        (UNEQUAL, "calamity", False),
+        (TEN, "prior", True),
+        (TEN, "calamity", True),
+    ],
+)
+def test_errors_by_antenna_are_those_of_the_whole_matrix(toy, kind, flagged, monkeypatch):
+    structure, sky, rms, known = parts_of(toy, kind, 0.01, flagged)
+    drawn = 0.01 * rms * complex_normal(np.random.default_rng(6), sky.shape)
+    problem = toy.problem(structure, visibilities=gain_products(toy.gains, structure.antennas) * sky + drawn, **known)
+    solution = solve(problem, GaussNewton())
+    whole = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
+    monkeypatch.setattr("calstudy.calibrate.gain_errors.MOST_UNKNOWNS", 0)
+    found = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
+    for name in ("amplitude", "phase"):
+        ratio = getattr(found, name) / getattr(whole, name)
+        known = np.isfinite(ratio)
+        assert np.array_equal(known, np.isfinite(whole.phase))
+        if flagged and kind == "calamity":
+            # Phases beside the gap that antenna 1 alone has: what other antennas have there, it lacks.
+            ratio[1] = 1
+        assert abs(np.mean(ratio[known]) - 1) < 0.01
+        assert np.std(ratio[known]) < 0.03
+        assert np.abs(ratio[known] - 1).max() < 0.15
 
 
 def test_errors_of_a_prior_that_is_too_narrow_are_too_small():

@@ -88,7 +88,7 @@ def test_pooling_weights_by_inverse_variance():
 @pytest.mark.parametrize("scale", SCALES)
 def test_all_steps_load_and_have_what_the_table_needs(scale):
     steps = [step for step, _ in load_ladder(scale=scale).steps]
-    assert len(steps) == 12
+    assert len(steps) == 13
     for step in steps:
         assert step.statements()
         assert all(item.why and item.quantity and item.sentence for item in step.statements())
@@ -109,6 +109,8 @@ def test_full_scale_thresholds_are_those_of_the_table():
     assert must["2.1 exact"] == must["2.1 fitted"] == "<= 1e-06"
     assert must["2.2 false_convergence"] == must["2.3 influence"] == "<= 0"
     assert must["2.3 bias"] == "<= 2"
+    assert must["2.4 amplitude_within_1"] == must["2.4 phase_within_1"] == "from 0.653 to 0.713"
+    assert must["2.4 amplitude_within_2"] == must["2.4 phase_within_2"] == "from 0.93 to 0.97"
     assert must["3.0 left"] == "<= 1"
     assert must["4.0 minredundant_bars"] == must["4.0 redundant_bars"] == ">= 0.9"
     assert must["4.1 minredundant_worst_pull"] == must["4.1 redundant_worst_pull"] == "<= 3"
