@@ -65,6 +65,9 @@ Calfits = Annotated[bool, typer.Option("--calfits", help="Also write the gains a
 ExpectedLoss = Annotated[
     bool, typer.Option("--expected-loss", help="Also write the signal loss that the fit is expected to cause.")
 ]
+GainErrors = Annotated[
+    bool, typer.Option(help="Give gains their errors by noise; of large arrays they take longer than the solves.")
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Read and check everything, say what would be done, and stop.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of an earlier calibration.")]
 
@@ -84,6 +87,7 @@ def calibrate(
     overrides: Set = None,
     output: Output = Path("calibrated"),
     calfits: Calfits = False,
+    gain_errors: GainErrors = True,
     expected_loss: ExpectedLoss = False,
     overwrite: Overwrite = False,
     max_memory: MaxMemory = None,
@@ -119,6 +123,7 @@ def calibrate(
         },
         "calibration": _calibration(settings_file, changes),
         "calfits": calfits,
+        "gain_errors": gain_errors,
         "expected_loss": expected_loss,
     }
     # They may use the path of the field in an experiment file.

@@ -149,6 +149,7 @@ class CalibrationFile(DataFile):
     """Measured data that are calibrated as a whole, and the results that are wanted; they go to `outputs.runs`."""
 
     calfits: bool = Field(False, description="Also write the gains as calfits.")
+    gain_errors: bool = Field(True, description="Give gains their errors by noise, which cost more than fast solves.")
     expected_loss: bool = Field(False, description="Also write the signal loss that the fit is expected to cause.")
 
 
@@ -176,10 +177,10 @@ class DataCalibration(DataStudy):
 
     @cached_property
     def tables(self) -> list[Task]:
-        """The calibration, its gains again with their errors, its quality, and the signal loss if it is wanted."""
+        """The calibration, its gains again with their errors, its quality, and the signal loss, as far as wanted."""
         expected = [expected_transfer(self.graph, WHOLE)] if self.file.expected_loss else []
-        errors = observed_gain_errors(self.graph, WHOLE)
-        return [calibrated(self.graph, WHOLE), errors, quality(self.graph), *expected]
+        errors = [observed_gain_errors(self.graph, WHOLE)] if self.file.gain_errors else []
+        return [calibrated(self.graph, WHOLE), *errors, quality(self.graph), *expected]
 
     def described(self) -> str:
         """Return a sentence on the data and the solves."""
@@ -233,11 +234,11 @@ class DataCalibration(DataStudy):
             work = Path(temporary)
             publish([made.products[task.key] for task in self.targets], work)
             solution = self._solution(made, read_json(work / SOLUTION), read_json(work / QUALITY)[WHOLE])
-            errors = read_json(work / ERRORS)["records"]
-            for record, found in zip(solution["records"], errors, strict=True):
-                record["gain_errors"] = found
+            if self.file.gain_errors:
+                for record, found in zip(solution["records"], read_json(work / ERRORS)["records"], strict=True):
+                    record["gain_errors"] = found
             for name in (QUALITY, ERRORS):
-                (work / name).unlink()
+                (work / name).unlink(missing_ok=True)
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
             if self.file.calfits:
                 from pyuvdata import UVCal

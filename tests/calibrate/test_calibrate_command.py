@@ -98,6 +98,18 @@ def test_the_expected_loss_is_written_and_how_far_the_fit_is_told(command, finis
     assert "expected-transfer.ee.h5" in told
 
 
+def test_gains_without_errors_are_the_same(command, finished, tmp_path):
+    folder, _ = finished
+    status, _ = command(folder / "data.uvh5", *OPTIONS, "--output", "plain", "--no-gain-errors")
+    assert status == 0
+    gains, known = (UVCal.from_file(str(path / "gains.calh5")) for path in (tmp_path / "plain", folder / "out"))
+    # Another order of tasks may round otherwise.
+    np.testing.assert_allclose(gains.gain_array, known.gain_array, rtol=1e-9)
+    records = json.loads((tmp_path / "plain" / "solution.json").read_text())["records"]
+    assert all("gain_errors" not in record for record in records)
+    assert not (tmp_path / "plain" / "gain-errors.json").exists()
+
+
 def test_everything_is_written_and_readable(finished):
     out, data = finished[0] / "out", finished[0] / "data.uvh5"
     assert {path.name for path in out.iterdir()} == {*WRITTEN, "gains.calfits", "expected-transfer.ee.h5"}
