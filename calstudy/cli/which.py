@@ -19,9 +19,10 @@ FIELDS = (
     (r"^instrument\.layout(\.path)?(?= =|:)", "LAYOUT"),
     (r"^instrument\.location(\.\w+)?(?= =|:)", "--site"),
     (r"^instrument\.beam(\.path)?(?= =|:)", "--beam"),
-    (r" \(in '[^']*'( and \d+ other cases?)?\)$", ""),
 )
-"""Fields in messages, and the options that set them; and the cases, because all have the same array."""
+"""Fields in messages, and the options that set them."""
+CASES = r" \(in '[^']*'( and \d+ other cases?)?\)$"
+"""The end of messages on fields, which names cases; all have the same array."""
 
 Layout = Annotated[
     str,
@@ -60,6 +61,7 @@ def which(
 
     The experiment is the published one, which: calstudy init --example which writes a copy, to be changed and run.
     """
+    from calstudy.base.package_files import published
     from calstudy.run.execution import Budget
     from calstudy.studies.load import load_study
     from calstudy.studies.show import describe_plan, show_plan, show_run
@@ -68,7 +70,7 @@ def which(
     changes = [*array_changes(layout, site, beam), *(overrides or ())]
     console, budget = Console(soft_wrap=True, highlight=False), Budget(workers, max_memory)
     try:
-        study = load_study(Path("which"), scale, changes)
+        study = load_study(published("experiments") / "which.yaml", scale, changes)
     except ExperimentError as error:
         raise ExperimentError(list(dict.fromkeys(map(_in_options, error.faults)))) from None
     except InputError as error:
@@ -86,7 +88,7 @@ def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
     """
     from calstudy.instrument.settings import LAYOUTS
 
-    changes = {"instrument.layout": _block(layout, "csv", (".csv", ".txt"))}
+    changes = {"instrument.layout": _block(layout, "csv", (".csv", ".txt", ".tsv", ".dat"))}
     if site is not None:
         changes["instrument.location"] = _place(site)
     if beam is None:
@@ -116,5 +118,6 @@ def _place(site: str) -> str:
 
 def _in_options(sentence: str) -> str:
     for pattern, replacement in FIELDS:
-        sentence = re.sub(pattern, replacement, sentence)
+        if re.search(pattern, sentence):
+            return re.sub(CASES, "", re.sub(pattern, replacement, sentence))
     return sentence

@@ -162,6 +162,10 @@ class GainCoverageFigure(StudyFigure):
         residual = experiment.variants.get("residual")
         if residual is not None and residual.calibrate and "noise" not in residual.components:
             return "needs noise in variants.residual"
+        fit = experiment.calibration
+        for field in ("smooth_gains", "gain_delay"):
+            if getattr(fit, field, None) is not None:
+                return f"needs gains with errors, which there are none of with calibration.{field}"
         return super().refusal(experiment)
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:

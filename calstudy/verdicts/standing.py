@@ -164,7 +164,8 @@ def _in_world(world: str, band: Mapping[str, Any]) -> InWorld:
 def advice(found: Sequence[InBand]) -> list[str]:
     """Return the question, and for each band of k which calibrator to take and what would break it first."""
     n_worlds = len({world.world for entry in found for world in entry.worlds})
-    sentences = [f"Bias below {found[0].limit:g} of the EoR in all {n_worlds} worlds?"] if found else []
+    where = f"all {n_worlds} worlds" if n_worlds > 1 else "the world"
+    sentences = [f"Bias below {found[0].limit:g} of the EoR in {where}?"] if found else []
     for low, high in dict.fromkeys(entry.band for entry in found):
         entries = [entry for entry in found if entry.band == (low, high)]
         sentences.append(f"k {low:g} to {high:g} h/Mpc: {'; '.join(_advice_in_band(entries))}")
@@ -181,12 +182,14 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
     if passed:
         first, *others = passed
         parts, least = [f"take {first.calibrator} ({first.numbers})"], first.transfer + MORE
-        if len(first.worlds) > 1:
-            parts.append(f"its bias is largest in {first.decisive[0].world}")
+        largest = first.decisive[0]
+        seen = abs(largest.bias) > SIGMAS * largest.bias_error
+        parts.append(f"its bias is largest in {largest.world} ({_short(largest.bias)})" if seen else "no bias is seen")
         parts += [f"others that pass: {_listed(others)}"] if others else []
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
-    parts += [f"{entry.calibrator} keeps more (T ≥ {entry.transfer:.2f}), but {entry}" for entry in tempting[:NAMED]]
+    keeps = "keeps more" if passed else "keeps much"
+    parts += [f"{entry.calibrator} {keeps} (T ≥ {entry.transfer:.2f}), but {entry}" for entry in tempting[:NAMED]]
     rest = len(failed) - len(tempting[:NAMED])
     return [*parts, f"{rest} of {len(entries)} fail"] if rest else parts
 

@@ -144,6 +144,9 @@ def test_csv_layout(tmp_path):
         # The layout format of pyuvsim, and what spreadsheets write.
         "# core\nName  Number  BeamID  E  N  U\na  7  0  0  0  0\n# broken\nb  3  0  10  2.5  -1\n",
         "Name;Number;East;North;Up\na;7;0;0;0\nb;3;10;2.5;-1\n",
+        # Local positions count, columns without a use may have no name, and cells may be empty.
+        "name,number,east_m,north_m,up_m,lat,lon,,\na,7,0,0,0,1,2,,\nb,3,10,2.5,-1,1,2,,\n",
+        "name\tnumber\teast_m\tnorth_m\tup_m\tnote\na\t7\t0\t0\t0\t\nb\t3\t10\t2.5\t-1\t\n",
         "\ufeffname\tnumber\teast_m\tnorth_m\tup_m\r\na\t7\t0\t0\t0\r\n\r\nb\t3\t10\t2.5\t-1\r\n",
     ],
 )

@@ -32,7 +32,8 @@ class CsvLayout(ArrayLayout):
     """Positions from a table with columns east_m, north_m, up_m, or latitude and longitude in degrees and height_m.
 
     `name` and `number` are optional columns, others are ignored. Columns are separated by commas, semicolons, tabs or
-    spaces, so that pyuvsim's files (Name Number BeamID E N U) can be used; lines that begin with # are comments.
+    spaces, so that pyuvsim's files (Name Number BeamID E N U) can be used. Lines that begin with # are comments; the
+    first other line names the columns. With both kinds of positions, east_m, north_m and up_m count.
     It needs `instrument.location`: such a table does not say where the array is, or not exactly.
     """
 
@@ -58,7 +59,7 @@ class CsvLayout(ArrayLayout):
             raise InputError(f"instrument.layout.path: there is no file {self.path}")
         rows = _read_rows(self.path)
         columns = set(rows[0]) if rows else set()
-        geodetic = {"latitude", "longitude"} <= columns
+        geodetic = {"latitude", "longitude"} <= columns and not set(LOCAL) <= columns
         missing = set(GEODETIC if geodetic else LOCAL) - columns
         if missing or len(rows) < 2:
             raise InputError(
@@ -82,9 +83,9 @@ def _read_rows(path: Path) -> Sequence[Mapping[str, str]]:
     """Return the rows of a table by the names in `COLUMNS`; raises InputError if it is none."""
     try:
         text = path.read_text(encoding="utf-8-sig")
-        lines = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-        if lines and not re.search("[,;\t]", lines[0]):
-            lines = [re.sub(r"\s+", "\t", line) for line in lines]
+        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        if lines and not re.search("[,;\t]", lines[0].strip()):
+            lines = [re.sub(r"\s+", "\t", line.strip()) for line in lines]
         separator = next((mark for mark in (",", ";", "\t") if lines and mark in lines[0]), ",")
         cells = list(csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
@@ -97,7 +98,7 @@ def _read_rows(path: Path) -> Sequence[Mapping[str, str]]:
         )
     known = {other: name for name, others in COLUMNS.items() for other in (name, *others)}
     names = [known.get(cell.lower(), cell) for cell in header]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name in COLUMNS if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"instrument.layout.path: {path} has the column {twice} twice")
     return [dict(zip(names, row, strict=True)) for row in rows]
@@ -110,7 +111,8 @@ def _about_their_mean(geodetic: np.ndarray, path: Path) -> np.ndarray:
     latitudes, longitudes, heights = geodetic.T
     if not (np.abs(latitudes) <= 90).all() or np.ptp(longitudes) > 1 or np.ptp(latitudes) > 1:
         raise InputError(
-            f"instrument.layout.path: latitudes in {path} must be from -90 to 90 degrees, and all within one degree"
+            f"instrument.layout.path: latitudes in {path} must be from -90 to 90 degrees, and latitudes and longitudes "
+            "within one degree of each other"
         )
     place = Place(latitudes.mean(), longitudes.mean(), heights.mean())
     found = EarthLocation.from_geodetic(longitudes, latitudes, heights)
