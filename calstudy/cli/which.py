@@ -94,10 +94,8 @@ def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
     if beam is None:
         # The site of a block, or of a user's file, is not known here.
         own = LAYOUTS.find(layout).site if re.fullmatch(r"[\w-]+", layout) else None
-        if (beam := BEAMS.get(site or own or "")) is None:
-            raise InputError(
-                "--beam: is needed, because the array is neither HERA's nor the MWA's: such as --beam airy"
-            )
+        if (beam := BEAMS.get(site or "") or BEAMS.get(own or "")) is None:
+            raise InputError("--beam: is needed, because none is known for this array and site: such as --beam airy")
     changes["instrument.beam"] = _block(beam, "beamfits", (".beamfits", ".fits"))
     return [f"{path}={value}" for path, value in changes.items()]
 
