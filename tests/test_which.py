@@ -82,6 +82,7 @@ def test_an_array_without_redundancy_loses_the_calibrator_that_needs_it():
     study = load_study(Path("which"), None, array_changes("golomb", None, None))
     refused = {study.title(label).partition(" in ")[0] for label in study.refusals}
     assert refused == {"redcal"}
+    assert any(note.startswith("redcal cannot work in any world: ") for note in study.notes)
 
 
 def test_a_run_ends_with_an_answer(positions, capsys):

@@ -249,6 +249,20 @@ class Comparison(Family):
         return tuple(note for note in first if all(note in found for found in others))
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """The notes of the cases, and which calibrators cannot work where."""
+        worlds: dict[tuple[str, str], list[str]] = {}
+        for case in self.cases:
+            if case.refusal:
+                worlds.setdefault((case.calibrator, case.refusal), []).append(case.world)
+        count = len(self.file.worlds)
+        refused = (
+            f"{calibrator} cannot work in {'any world' if len(found) == count else ', '.join(found)}: {reason}"
+            for (calibrator, reason), found in worlds.items()
+        )
+        return (*super().notes, *refused)
+
+    @property
     def _labels(self) -> dict[str, Any]:
         """Labels of calibrators and worlds, and refusals: world, calibrator and reason."""
         return {
