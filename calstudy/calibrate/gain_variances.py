@@ -18,7 +18,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from calstudy.calibrate.problem import CalibrationProblem
 from calstudy.calibrate.tangent_space import TangentSpace
@@ -141,7 +140,9 @@ def _blocks(
 
 def _half(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return L^-1 rows^T for a matrix L L^T: the inverse within the rows is its product with itself."""
-    return scipy.linalg.solve_triangular(np.linalg.cholesky(matrix), rows.T, lower=True, check_finite=False)
+    from scipy.linalg import solve_triangular
+
+    return solve_triangular(np.linalg.cholesky(matrix), rows.T, lower=True, check_finite=False)
 
 
 def _scaled(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

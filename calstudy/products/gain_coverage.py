@@ -53,7 +53,7 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=1):
             found.append(pulls(solve.errors, solve.gains, reference))
         if not found:
             raise InputError(f"no errors of gains: {'; '.join(sorted(set(reasons)))}")
-        np.savez(output / COVERAGE, **asdict(GainCoverage.of(found)))
+        np.savez(output / COVERAGE, allow_pickle=False, **asdict(GainCoverage.of(found)))
         lacking = [f"{len(reasons)} solves have no errors of gains: {'; '.join(sorted(set(reasons)))}"]
         return {"solves": len(found), "warnings": lacking if reasons else []}
 

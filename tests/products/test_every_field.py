@@ -42,6 +42,8 @@ OTHER: dict[str, list[Any]] = {
     "DipoleErrors.dead": [{"set": {"antennas": [0], "x": [1]}}],
     "BeamErrors.swapped": [[0]],
     "DeadAntennas.antennas": [[1]],
+    "_Drift.antennas": [[1]],
+    "Swing.antennas": [[1]],
     "RadiometerNoise.seeds": [[5, 6]],
     "NoiseRelativeToEor.seeds": [[5, 6]],
     "NoiseRelativeToForegrounds.seeds": [[5, 6]],
