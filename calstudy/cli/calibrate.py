@@ -6,16 +6,16 @@ import json
 import re
 import statistics
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
-from calstudy.base.errors import ExperimentError, InputError
-from calstudy.cli.options import MaxMemory
+from calstudy.base.errors import InputError
+from calstudy.cli.options import MaxMemory, named_as_options
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -129,7 +129,7 @@ def calibrate(
     # They may use the path of the field in an experiment file.
     texts = [f"calibration.{text.strip().removeprefix('calibration.')}" for text in overrides or []]
     console = Console(soft_wrap=True, highlight=False)
-    with _named_as_options(output), quiet_libraries():
+    with named_as_options(partial(_in_options, output)), quiet_libraries():
         require_free(output, overwrite)
         study = DataCalibration.load(calibration_file(sections, output, texts))
         study, _ = study.sized_to(Budget(workers=1, max_memory=max_memory))
@@ -178,22 +178,13 @@ def _calibration(path: Path | None, changes: Mapping[str, Any]) -> dict[str, Any
     return content
 
 
-@contextmanager
-def _named_as_options(output: Path) -> Iterator[None]:
-    """Name the options in place of the fields of files in errors."""
+def _in_options(output: Path, text: str) -> str:
+    """Name the options in place of the fields of files."""
     from calstudy.studies.calibration import UNFINISHED
 
-    def named(text: str) -> str:
-        for field, option in OPTIONS:
-            text = re.sub(field, option, text)
-        return text.replace(f"outputs.store = {str((output / UNFINISHED).resolve())!r}", f"--output {output}")
-
-    try:
-        yield
-    except ExperimentError as error:
-        raise ExperimentError([named(sentence) for sentence in error.faults]) from None
-    except InputError as error:
-        raise type(error)(named(str(error))) from None
+    for field, option in OPTIONS:
+        text = re.sub(field, option, text)
+    return text.replace(f"outputs.store = {str((output / UNFINISHED).resolve())!r}", f"--output {output}")
 
 
 def _show(solution: Mapping[str, Any], output: Path, console: Console) -> int:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
 
 StudyFile = Annotated[
     Path,
@@ -49,6 +51,17 @@ MOVED = {
     "schema": "is calstudy fields --schema FILE",
 }
 """What took the place of commands of earlier versions."""
+
+
+@contextmanager
+def named_as_options(renamed: Callable[[str], str]) -> Iterator[None]:
+    """Rename the fields of files in errors to the options of a command; equal sentences are said once."""
+    try:
+        yield
+    except ExperimentError as error:
+        raise ExperimentError(list(dict.fromkeys(map(renamed, error.faults)))) from None
+    except InputError as error:
+        raise type(error)(renamed(str(error))) from None
 
 
 class Sections(TyperGroup):

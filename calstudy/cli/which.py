@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calstudy.base.errors import ExperimentError, InputError
-from calstudy.cli.options import MaxMemory, Scale, Set, Workers
+from calstudy.base.errors import InputError
+from calstudy.cli.options import MaxMemory, Scale, Set, Workers, named_as_options
 
 BEAMS = {"hera": "hera", "mwa": "mwa-embedded-element"}
 """Beams of the antennas of sites."""
@@ -57,9 +57,10 @@ def which(
     max_memory: MaxMemory = None,
     dry_run: Plan = False,
 ) -> None:
-    """Which calibration to trust on an array: simulate the standard calibrators in the standard worlds, and say.
+    """Simulate an array with the standard calibrators in the standard worlds, and say which calibration to trust.
 
-    The experiment is the published one, which: calstudy init --example which writes a copy, to be changed and run.
+    This is the published experiment which, with another array. calstudy init --example which writes a copy, in which
+    calibrators and worlds can be changed.
     """
     from calstudy.base.package_files import published
     from calstudy.run.execution import Budget
@@ -69,12 +70,8 @@ def which(
 
     changes = [*array_changes(layout, site, beam), *(overrides or ())]
     console, budget = Console(soft_wrap=True, highlight=False), Budget(workers, max_memory)
-    try:
+    with named_as_options(_in_options):
         study = load_study(published("experiments") / "which.yaml", scale, changes)
-    except ExperimentError as error:
-        raise ExperimentError(list(dict.fromkeys(map(_in_options, error.faults)))) from None
-    except InputError as error:
-        raise InputError(_in_options(str(error))) from None
     if dry_run:
         show_plan(describe_plan(study, budget), console)
         return
