@@ -17,7 +17,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Container, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -381,12 +381,25 @@ def load_file(path: Path) -> ModuleType:
         # At the end, so that no file beside it stands for an installed package.
         sys.path.append(str(path.parent))
     try:
-        with user_code(path.name):
+        with _without_compiled_files(path, *beside.values()), user_code(path.name):
             spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
     return module
+
+
+@contextmanager
+def _without_compiled_files(*paths: Path) -> Iterator[None]:
+    """Neither read nor write compiled code of files, which Python takes for current if second and size are the same."""
+    for path in paths:
+        with suppress(OSError):
+            Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
+    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+    try:
+        yield
+    finally:
+        sys.dont_write_bytecode = before
 
 
 def _read_code(path: Path) -> tuple[str, dict[str, Path]]:

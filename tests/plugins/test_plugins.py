@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import pkgutil
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +15,7 @@ import yaml
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.plugins import load_file
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
@@ -129,3 +131,20 @@ def test_a_study_of_own_code_runs_and_plays_no_part_of_the_paper(tmp_path):
     )
     # The sky model is the truth, so that what is left is the noise less what the gains absorb of it.
     assert 0.4 < np.std(residual) / np.std(thermal) < 1.0
+
+
+@pytest.mark.parametrize("changed", ["mine", "beside"])
+def test_code_that_changes_within_a_second_to_the_same_size_is_run_anew(tmp_path, changed):
+    # Modules of equal names are one to Python.
+    beside = f"beside_{changed}"
+    texts = {"mine": f"from {beside} import X\n\nY = 1\n", beside: "X = 1\n"}
+    for number in (1, 2):
+        name = changed if changed in texts else beside
+        texts[name] = texts[name].replace("= 1", f"= {number}")
+        for stem, text in texts.items():
+            path = tmp_path / f"{stem}.py"
+            path.write_text(text, encoding="utf-8")
+            # Python takes compiled code for that of a file of the same second and size.
+            os.utime(path, ns=(10**18 + number, 10**18 + number))
+        module = load_file(tmp_path / "mine.py")
+        assert {"mine": module.Y, "beside": module.X}[changed] == number
