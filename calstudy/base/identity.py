@@ -8,8 +8,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from calstudy.base.plugins import Plugin, digest_file
+from calstudy.base.plugins import Plugin
 from calstudy.base.schema import defaults
+from calstudy.base.user_code import digest_file
 
 
 def identity(value: Any) -> Any:

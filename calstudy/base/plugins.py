@@ -8,22 +8,14 @@ a file has several, ``calibrator: mine.py:MeanGain``.
 
 from __future__ import annotations
 
-import ast
-import gc
-import hashlib
-import importlib.util
 import inspect
 import re
-import sys
-import traceback
-from collections.abc import Callable, Container, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from contextvars import ContextVar
-from functools import cached_property, lru_cache
+from collections.abc import Container, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from threading import Lock
 from types import ModuleType
 from typing import Any, ClassVar, TypeVar
 
@@ -31,32 +23,10 @@ from pydantic import model_validator
 from pydantic.json_schema import JsonSchemaValue
 
 from calstudy.base.errors import InputError, nearest
-from calstudy.base.files import sha256
 from calstudy.base.schema import Kinds, Section
+from calstudy.base.user_code import beside_of, digest_file, load_file, user_code
 
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
-FILE_MODULE = "calstudy_plugin_"
-"""What the names of modules that were read from a file start with."""
-
-
-_PARSING = Lock()
-
-
-def parse(code: str) -> ast.Module:
-    """Parse Python code while no other thread can run.
-
-    Python 3.11 has one counter of the depth of a tree for all threads, and fails with SystemError where another thread
-    parses in the meantime. A thread is left while it parses only by the garbage collector, where it runs code of
-    objects that it deletes.
-    """
-    with _PARSING:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            return ast.parse(code)
-        finally:
-            if collects:
-                gc.enable()
 
 
 class Plugin(Section):
@@ -299,178 +269,6 @@ class Registry(Kinds[P]):
 
 def _named_after(module: str) -> str:
     return module.rpartition(".")[2].replace("_", "-")
-
-
-def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal, cached while the file does not change."""
-    status = path.stat()
-    return _digest_of(str(path), status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=256)
-def _digest_of(path: str, modified: int, size: int) -> str:
-    del modified, size
-    return sha256(Path(path))
-
-
-_REFUSED: ContextVar[str] = ContextVar("refused", default="")
-
-
-@contextmanager
-def without_code_of_files(instead: str) -> Iterator[None]:
-    """Refuse to run Python files in the block, with an InputError that says what can be done instead."""
-    token = _REFUSED.set(instead)
-    try:
-        yield
-    finally:
-        _REFUSED.reset(token)
-
-
-def beside_of(path: Path) -> dict[str, Path]:
-    """Return the modules that a Python file imports from its own folder, and those that these import, by name."""
-    found: dict[str, Path] = {}
-    waiting = list(_imported(path))
-    while waiting:
-        name = waiting.pop()
-        place = path.parent.joinpath(*name.split("."))
-        for candidate in (place.with_suffix(".py"), place / "__init__.py"):
-            if candidate.is_file() and candidate != path and name not in found:
-                found[name] = candidate
-                waiting += _imported(candidate)
-    return found
-
-
-def _imported(path: Path) -> Iterator[str]:
-    """Yield the names of all modules that a file may import, and of the packages that they are in."""
-    try:
-        tree = parse(path.read_text(encoding="utf-8"))
-    except (ValueError, SyntaxError):
-        return  # Whoever runs it is told.
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names = [item.name for item in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module, *(f"{node.module}.{item.name}" for item in node.names)]
-        else:
-            continue
-        for name in names:
-            parts = name.split(".")
-            yield from (".".join(parts[: count + 1]) for count in range(len(parts)))
-
-
-def load_file(path: Path) -> ModuleType:
-    """Run a Python file as a module, once for each version of its content, and return the module.
-
-    It can import modules of its folder, which are run again if the content of one has changed. Raises InputError if the
-    file cannot be read or is not valid Python, if running it raises an error (the message names the line), or if code
-    of files is refused.
-    """
-    content, beside = _read_code(path)
-    name = f"{FILE_MODULE}{path.stem}_{hashlib.sha256(f'{path}{content}'.encode()).hexdigest()[:12]}"
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise InputError(f"{str(path)!r} is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    for other, found in beside.items():
-        if getattr(sys.modules.get(other), "__file__", None) == str(found):
-            del sys.modules[other]
-    if beside and str(path.parent) not in sys.path:
-        # At the end, so that no file beside it stands for an installed package.
-        sys.path.append(str(path.parent))
-    try:
-        with _without_compiled_files(path, *beside.values()), user_code(path.name):
-            spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module
-
-
-@contextmanager
-def _without_compiled_files(*paths: Path) -> Iterator[None]:
-    """Neither read nor write compiled code of files, which Python takes for current if second and size are the same."""
-    for path in paths:
-        with suppress(OSError):
-            Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
-    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-    try:
-        yield
-    finally:
-        sys.dont_write_bytecode = before
-
-
-def _read_code(path: Path) -> tuple[str, dict[str, Path]]:
-    """Return the content of a Python file with digests of the modules beside it, and these modules; see `load_file`."""
-    if instead := _REFUSED.get():
-        raise InputError(f"{str(path)!r} is code, which is not run here; {instead}")
-    try:
-        text = path.read_text(encoding="utf-8")
-        parse(text)
-        beside = beside_of(path)
-        content = "".join([text, *(f"{name} {digest_file(found)}" for name, found in sorted(beside.items()))])
-    except OSError as error:
-        raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{str(path)!r} is not a text file in UTF-8") from None
-    except (SyntaxError, ValueError) as error:
-        line = f"line {error.lineno}: {error.msg}" if isinstance(error, SyntaxError) else str(error)
-        raise InputError(f"{str(path)!r} is not valid Python ({line})") from None
-    return content, beside
-
-
-def load_function(path: Path, name: str) -> Callable[..., Any]:
-    """Return a function that a Python file defines.
-
-    Raises InputError if the file cannot be run, or defines no such function.
-    """
-    module = load_file(path)
-    functions = {
-        key: value
-        for key, value in vars(module).items()
-        if inspect.isfunction(value) and value.__module__ == module.__name__
-    }
-    if name not in functions:
-        listed = f"it has: {', '.join(functions)}" if functions else "it has none"
-        raise InputError(f"{name!r} is not a function of {path.name} ({listed})")
-    return functions[name]
-
-
-class UserCodeError(InputError):
-    """A user's own code raised an error; the message has its type, text, file and line, and nothing of calstudy."""
-
-
-@contextmanager
-def user_code(name: str) -> Iterator[None]:
-    """Run a user's code; its errors, SystemExit included, become a `UserCodeError` that names the line, or else `name`.
-
-    `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
-    defects of calstudy, except where the call itself does not fit the user's function.
-    """
-    try:
-        yield
-    except (InputError, KeyboardInterrupt, GeneratorExit):
-        raise
-    except BaseException as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
-        if not frames and not isinstance(error, TypeError | SystemExit | ImportError):
-            raise
-        lines = [f"{Path(frame.filename).name} line {frame.lineno}, in {frame.name}" for frame in frames[-1:]]
-        place = lines[0] if lines else name
-        if isinstance(error, SystemExit):
-            text = f"it ended the process (sys.exit, status {error.code}); raise an error instead"
-        else:
-            text = f"{type(error).__name__}: {error}"
-        raise UserCodeError(f"{place}: {text}") from error
-
-
-def _is_users(filename: str) -> bool:
-    """Return whether a file belongs neither to calstudy, nor to Python or an installed package."""
-    ours = str(Path(__file__).resolve().parents[1])
-    path = str(Path(filename).resolve())
-    return not path.startswith((ours, sys.base_prefix, sys.prefix)) and "site-packages" not in path and "<" not in path
 
 
 def guarded(thing: Plugin) -> AbstractContextManager[None]:

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from calstudy.base.errors import InputError
-from calstudy.base.plugins import guarded, without_code_of_files
+from calstudy.base.plugins import guarded
 from calstudy.base.resources import Cost
+from calstudy.base.user_code import without_code_of_files
 from calstudy.calibrate.settings import GainFit
 from calstudy.claims.paper import Paper
 from calstudy.claims.realizations import PooledResults

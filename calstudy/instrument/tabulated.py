@@ -16,7 +16,7 @@ from scipy.interpolate import interp1d
 from calstudy.base.errors import InputError
 from calstudy.base.kept_arrays import kept_arrays
 from calstudy.base.package_files import BEAM
-from calstudy.base.plugins import digest_file
+from calstudy.base.user_code import digest_file
 from calstudy.instrument import beam_frequencies
 from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
 

@@ -27,7 +27,7 @@ from pydantic import BaseModel
 
 from calstudy.base.files import digest_json, replacing
 from calstudy.base.package_files import PackageFile, default_directory
-from calstudy.base.plugins import FILE_MODULE, parse
+from calstudy.base.user_code import FILE_MODULE, parse
 from calstudy.run.task import Task
 
 PACKAGE = __name__.partition(".")[0]

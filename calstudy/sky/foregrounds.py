@@ -19,7 +19,7 @@ from scipy.interpolate import RectBivariateSpline
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.package_files import G4JY, HASLAM
-from calstudy.base.plugins import load_function, user_code
+from calstudy.base.user_code import load_function, user_code
 from calstudy.sky import settings as section
 from calstudy.sky.catalogue import (
     GLEAM_SOURCES,

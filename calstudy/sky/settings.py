@@ -9,9 +9,9 @@ from pydantic import Field, ValidationInfo, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import default_directory
-from calstudy.base.plugins import load_function
 from calstudy.base.schema import Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
+from calstudy.base.user_code import load_function
 
 GLEAM_FILE = "gleam_egc.vot"
 """Name of the catalogue in the folder of downloads."""

@@ -16,8 +16,9 @@ from pydantic.json_schema import models_json_schema
 from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError, nearest
-from calstudy.base.plugins import Plugin, Registry, load_file
+from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import KindField, Kinds
+from calstudy.base.user_code import load_file
 from calstudy.experiment.model import Experiment
 from calstudy.studies.study import KINDS, Study, built_in_kinds
 

@@ -9,7 +9,7 @@ from pyuvdata import UVCal
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
-from calstudy.base.plugins import UserCodeError
+from calstudy.base.user_code import UserCodeError
 from calstudy.base.visibilities import antenna_indices, to_cube
 from calstudy.corrupt.interface import Effect, apply_effect, draw_truth
 from calstudy.products import corruption

@@ -11,7 +11,7 @@ from threading import Event
 import pytest
 
 import calstudy
-from calstudy.base.plugins import parse
+from calstudy.base.user_code import parse
 
 CODES = [path.read_text(encoding="utf-8") for path in sorted(Path(calstudy.__file__).parent.rglob("*.py"))][::3]
 

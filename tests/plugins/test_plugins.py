@@ -15,7 +15,7 @@ import yaml
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.plugins import load_file
+from calstudy.base.user_code import load_file
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
@@ -148,3 +148,34 @@ def test_code_that_changes_within_a_second_to_the_same_size_is_run_anew(tmp_path
             os.utime(path, ns=(10**18 + number, 10**18 + number))
         module = load_file(tmp_path / "mine.py")
         assert {"mine": module.Y, "beside": module.X}[changed] == number
+
+
+@pytest.mark.parametrize("form", ["module", "package"])
+def test_files_import_the_modules_of_their_own_folders(tmp_path, monkeypatch, form):
+    # The folder of a third one is on the path of Python, as the current folder is.
+    monkeypatch.syspath_prepend(tmp_path / "elsewhere")
+    for number, place in enumerate(["elsewhere", "first", "second"]):
+        (tmp_path / place).mkdir()
+        beside = tmp_path / place / {"module": "same_name.py", "package": "same_name/__init__.py"}[form]
+        beside.parent.mkdir(exist_ok=True)
+        beside.write_text(f"from other_name import OTHER\n\nX = {number}\n", encoding="utf-8")
+        (tmp_path / place / "other_name.py").write_text(f"OTHER = {number}\n", encoding="utf-8")
+        (tmp_path / place / "mine.py").write_text("from same_name import OTHER, X\n", encoding="utf-8")
+    found = [load_file(tmp_path / place / "mine.py") for place in ("first", "second")]
+    assert [(module.X, module.OTHER) for module in found] == [(1, 1), (2, 2)]
+
+
+@pytest.mark.parametrize("order", [("late", "early"), ("early", "late")])
+def test_imports_in_functions_of_modules_with_one_name_are_refused(tmp_path, order):
+    name = f"beside_{order[0]}"
+    texts = {"late": f"def x():\n    import {name}\n\n    return {name}.X\n", "early": f"from {name} import X\n"}
+    for number, place in enumerate(order):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / f"{name}.py").write_text(f"X = {number}\n", encoding="utf-8")
+        (tmp_path / place / "mine.py").write_text(texts[place], encoding="utf-8")
+    load_file(tmp_path / order[0] / "mine.py")
+    with pytest.raises(InputError, match=f"import {name} at the top of both files, or rename it"):
+        load_file(tmp_path / order[1] / "mine.py")
+    # The same content in another folder is the same code.
+    (tmp_path / order[1] / f"{name}.py").write_text("X = 0\n", encoding="utf-8")
+    assert load_file(tmp_path / order[1] / "mine.py")

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 
 from calstudy.base.errors import DiskError, ExperimentError, InputError
-from calstudy.base.plugins import UserCodeError
 from calstudy.base.resources import Cost
+from calstudy.base.user_code import UserCodeError
 from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, Workers, WorkOrder, execute, largest_disk, perform, schedule
 from calstudy.run.leases import Lease

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tiny import of_the_paper
 
-from calstudy.base.plugins import load_file
+from calstudy.base.user_code import load_file
 from calstudy.experiment.files import validate
 from calstudy.run import execution as performing
 from calstudy.run.execution import WorkOrder, perform
