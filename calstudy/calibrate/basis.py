@@ -2,7 +2,10 @@
 
 Paper Eq. FGMODEL models each intrinsic visibility as a sum of DPSS (Slepian 1978) whose delays reach the horizon of its
 baseline. Half-widths are rounded up to a step, so that baselines fall into buckets with one basis each and no basis is
-padded with zeros.
+padded with zeros for others.
+
+The sequences are those of the band with data. Sequences of a wider band, cut at its flagged edges, follow smooth gains
+common to all antennas: with two flagged channels at either end of 96, such gains are wrong by a tenth.
 """
 
 from __future__ import annotations
@@ -173,8 +176,15 @@ def _model_vectors(grid: ChannelGrid, half_bandwidth: float, prior: bool) -> np.
     return restrict(dpss_vectors(grid.n_channels, half_bandwidth), grid)
 
 
+WHOLE_BAND = slice(None)
+
+
 def make_basis(
-    lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings, prior: bool = False
+    lengths: np.ndarray,
+    frequencies: np.ndarray,
+    settings: BasisSettings,
+    prior: bool = False,
+    band: slice = WHOLE_BAND,
 ) -> ForegroundBasis:
     """Build the foreground basis of models with the given baseline lengths (paper Eq. FGMODEL).
 
@@ -188,10 +198,11 @@ def make_basis(
     prior
         Use a root of the covariance of a flat wedge with variance one per channel (see `flat_wedge_root`) in place of
         orthonormal vectors.
+    band : the channels that foregrounds are modelled in; vectors are zero in the others
     """
-    n_frequencies = len(frequencies)
-    grid = channel_grid(np.asarray(frequencies, float))
-    width = grid.width
+    modelled = np.asarray(frequencies, float)[band]
+    grid = channel_grid(modelled)
+    width, n_modelled = grid.width, len(modelled)
     half_widths = delay_half_widths(lengths, settings)
     buckets = []
     for half_width in np.unique(half_widths):
@@ -199,14 +210,17 @@ def make_basis(
             raise InputError("calibration.basis: the delay half-width is 0 s; set min_delay or buffer above zero")
         product = half_width * width
         vectors = _model_vectors(grid, grid.n_channels * product, prior) if product < 0.5 else None
-        if vectors is None or vectors.shape[1] >= n_frequencies:
+        if vectors is None or vectors.shape[1] >= n_modelled:
             raise InputError(
-                f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_frequencies} "
+                f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_modelled} "
                 f"channels of {width / 1e3:.4g} kHz, so that foregrounds would fit any data; "
                 "use shorter baselines, a smaller buffer, or more or narrower channels"
             )
+        if n_modelled < len(frequencies):
+            inside, vectors = vectors, np.zeros((len(frequencies), vectors.shape[1]))
+            vectors[band] = inside
         buckets.append(Bucket(float(half_width), np.flatnonzero(half_widths == half_width), vectors))
-    return ForegroundBasis(tuple(buckets), len(half_widths), n_frequencies)
+    return ForegroundBasis(tuple(buckets), len(half_widths), len(frequencies))
 
 
 def require_room(length: float, frequencies: np.ndarray, settings: BasisSettings) -> None:

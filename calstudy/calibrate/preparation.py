@@ -40,7 +40,7 @@ class PreparedFit:
         The calibrated visibilities: without the autocorrelations, unless they are fitted. Indices of antennas in the
         structure are those of `data.numbers`.
     fitted : mask of these baselines in the observation, bool, (Nbls,)
-    structure : structure of the fit of one integration
+    structure : structure of the fit of one integration that has data at both ends of the band
     weights
         Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Weights that
         come from the gains are those of unity gains.
@@ -115,16 +115,25 @@ def problem_at(
 def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:
     """Return the problem of some consecutive integrations together, or the reason why there is none.
 
-    Weights that come from the gains are those of unity gains.
+    Weights that come from the gains are those of unity gains. Foregrounds are modelled from the first channel with
+    data to the last.
     """
-    structure = repeat_structure(prepared.structure, times.stop - times.start)
 
     def rows(cube: np.ndarray) -> np.ndarray:
-        return cube[times, :, :, polarization].reshape(structure.n_baselines, structure.n_frequencies)
+        return cube[times, :, :, polarization].reshape(-1, cube.shape[2])
 
     weights, visibilities = rows(prepared.weights), rows(prepared.data.visibilities)
-    if not weights.any():
+    with_data = np.flatnonzero(weights.any(axis=0))
+    if not with_data.size:
         return "every sample is flagged or has no weight"
+    band = slice(int(with_data[0]), int(with_data[-1]) + 1)
+    try:
+        one = (
+            prepared.structure if band == slice(0, weights.shape[1]) else make_structure(prepared.data, settings, band)
+        )
+    except InputError as error:
+        return f"between flagged edges of the band: {error}"
+    structure = repeat_structure(one, times.stop - times.start)
     if not np.any(visibilities, where=weights > 0):
         return "the data are zero"
     sky = None if prepared.sky is None else rows(prepared.sky)

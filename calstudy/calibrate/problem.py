@@ -13,7 +13,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
-from calstudy.calibrate.basis import Bucket, ForegroundBasis, gain_vectors, make_basis
+from calstudy.calibrate.basis import WHOLE_BAND, Bucket, ForegroundBasis, gain_vectors, make_basis
 from calstudy.calibrate.settings import MODELS_AT_ONCE, ForegroundFit, GainFit
 from calstudy.instrument.layouts import redundant_groups
 
@@ -299,14 +299,14 @@ def gain_products(gains: np.ndarray, antennas: np.ndarray) -> np.ndarray:
     return gains[antennas[:, 0]] * gains[antennas[:, 1]].conj()
 
 
-def make_structure(frame: Frame, settings: GainFit) -> FitStructure:
+def make_structure(frame: Frame, settings: GainFit, band: slice = WHOLE_BAND) -> FitStructure:
     """Return the structure of the fit of one integration; its antennas are those of the frame.
 
     A redundant group is modelled with the basis of its longest baseline. Raises InputError if the basis does not fit
-    into the channels (see `calstudy.calibrate.basis.make_basis`).
+    into the channels of the band (see `calstudy.calibrate.basis.make_basis`).
     """
     if isinstance(settings, ForegroundFit) and not settings.frozen:
-        structure = _foregrounds(frame, settings)
+        structure = _foregrounds(frame, settings, band)
     else:
         basis = _no_basis(frame.n_baselines, frame.n_channels)
         structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
@@ -316,16 +316,16 @@ def make_structure(frame: Frame, settings: GainFit) -> FitStructure:
     return replace(structure, models_at_once=settings.models_at_once)
 
 
-def _foregrounds(frame: Frame, settings: ForegroundFit) -> FitStructure:
+def _foregrounds(frame: Frame, settings: ForegroundFit, band: slice) -> FitStructure:
     prior = settings.foreground_prior
     if not settings.grouped:
-        basis = make_basis(frame.lengths, frame.frequencies, settings.basis, prior.finite)
+        basis = make_basis(frame.lengths, frame.frequencies, settings.basis, prior.finite, band)
         structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
         return replace(structure, prior="own") if prior.finite else structure
     groups = redundant_groups(frame.vectors, settings.redundancy_tolerance)
     longest = np.zeros(groups.index.max() + 1)
     np.maximum.at(longest, groups.index, frame.lengths)
-    basis = make_basis(longest, frame.frequencies, settings.basis, prior.finite)
+    basis = make_basis(longest, frame.frequencies, settings.basis, prior.finite, band)
     structure = FitStructure(frame.antennas, frame.n_antennas, basis, groups.index, groups.conjugated)
     if not prior.finite:
         return structure

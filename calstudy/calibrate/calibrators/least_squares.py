@@ -95,12 +95,16 @@ def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
 class Calamity(_LeastSquares, ForegroundFit):
     """Gains are fitted together with a smooth foreground model of each baseline (paper Eq. LOGLIKELIHOOD)."""
 
+    # Foregrounds are modelled between the flagged edges of the band since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "calamity"
 
 
 class CalamityRedundant(_LeastSquares, ForegroundFit):
     """Gains are fitted with a smooth foreground model of each redundant group (paper Eq. LOGLIKELIHOODREDUNDANT)."""
 
+    # Foregrounds are modelled between the flagged edges of the band since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "calamity-redundant"
     foreground_prior: ForegroundPrior = ForegroundPrior(deviation=0.0, shared_deviation="infinite")
 
@@ -120,7 +124,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    version: ClassVar[int] = 3
+    # Foregrounds are modelled between the flagged edges of the band since 4.
+    version: ClassVar[int] = 4
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -133,7 +138,8 @@ class Unified(_LeastSquares, ForegroundFit):
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    version: ClassVar[int] = 3
+    # Foregrounds are modelled between the flagged edges of the band since 4.
+    version: ClassVar[int] = 4
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -144,6 +150,8 @@ class Unified(_LeastSquares, ForegroundFit):
 class EmpiricalBayes(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors fill the modelled delays; the data tell their size."""
 
+    # Foregrounds are modelled between the flagged edges of the band since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"
