@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import IO, Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -60,20 +61,54 @@ def save_blank(figure: Figure, stream: IO[bytes], **settings: Any) -> None:
     stream.write(PNG)
 
 
+def save_once(drawn: set[str]) -> Callable[..., None]:
+    """Return what draws the first picture of each name and format, and writes pictures of one pixel after it."""
+    draw = Figure.savefig
+
+    def save(figure: Figure, stream: IO[bytes], **settings: Any) -> None:
+        # `replacing` writes to a hidden file, the name of the picture followed by a dash and random digits.
+        picture = Path(stream.name).name.rpartition("-")[0]
+        if picture in drawn:
+            save_blank(figure, stream)
+        else:
+            drawn.add(picture)
+            draw(figure, stream, **settings)
+
+    return save
+
+
 @pytest.fixture(autouse=True, scope="module")
 def blank_pictures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Save figures as pictures of one pixel, but for tests/figures and modules that say `DRAWN = True`.
+    """Save figures as pictures of one pixel, but for tests/figures; where `DRAWN` is true, each name is drawn once.
 
-    Laying out and saving figures is most of what a small study takes. They are still made, from the same arrays.
+    Laying out and saving figures is most of what a small study takes. They are still made, from the same arrays. With
+    `DRAWN`, all are laid out.
     """
-    if request.path.parent.name == "figures" or getattr(request.module, "DRAWN", False):
+    if request.path.parent.name == "figures":
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", save_blank)
-        # Figures are laid out before they are saved.
-        patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
+        if getattr(request.module, "DRAWN", False):
+            patch.setattr(Figure, "savefig", save_once(set()))
+        else:
+            patch.setattr(Figure, "savefig", save_blank)
+            # Figures are laid out before they are saved.
+            patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
         yield
+
+
+@pytest.fixture(scope="session")
+def shared_store(tmp_path_factory) -> Path:
+    """A store for runs of the tiny experiment that may find products made: those of all files share what is the same.
+
+    Without it every run would simulate, and most would calibrate, the same again. Processes of pytest-xdist share it.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    folder = folder / "shared-store"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import run_command
+from command_line import run_and_read, run_command
 from tiny import of_the_paper, tiny
 
 from calstudy.calibrate.settings import BasisSettings
@@ -31,6 +31,21 @@ def refused(result: subprocess.CompletedProcess) -> str:
     assert result.returncode == 2
     assert "Traceback" not in result.stderr
     return result.stderr
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    """The folder of a test, in which commands are run, with lines of 160 letters."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    return tmp_path
+
+
+def plan_of(capsys, file: str) -> str:
+    """Return what ``calstudy plan`` prints."""
+    status, written = run_and_read(capsys, "plan", file)
+    assert status == 0, written.err
+    return written.out
 
 
 def imported_by(code: str, names: tuple[str, ...], cwd: Path) -> list[str]:
@@ -58,10 +73,14 @@ SLOW_TO_IMPORT = (
 
 
 def test_calibrators_leave_keras_to_those_who_use_it(tmp_path):
-    code = "import calstudy.calibrate.calamity"
-    assert imported_by(code, ("tensorflow", "keras", "sklearn"), tmp_path) == ["tensorflow"]
-    used = f"{code}\nimport tensorflow\ntensorflow.keras.optimizers.Adamax(0.1)"
-    assert "keras" in imported_by(used, ("keras",), tmp_path)
+    code = (
+        "import calstudy.calibrate.calamity\n"
+        "assert 'tensorflow' in sys.modules\n"
+        "assert not {'keras', 'sklearn'} & set(sys.modules)\n"
+        "import tensorflow\n"
+        "tensorflow.keras.optimizers.Adamax(0.1)"
+    )
+    assert imported_by(code, ("keras",), tmp_path) == ["keras"]
 
 
 def test_plans_import_no_library_that_only_stages_need(tmp_path):
@@ -97,12 +116,13 @@ def test_a_plan_with_every_figure_imports_no_library_that_only_stages_need(tmp_p
     assert imported_by(code, SLOW_TO_IMPORT, tmp_path) == []
 
 
-def test_all_faults_of_a_file_are_told_on_standard_error(tmp_path):
-    (tmp_path / "bad.yaml").write_text("{name: bad, bogus: 1, instrument: {channels: {width: 80}}}")
-    told = refused(calstudy("run", "bad.yaml", cwd=tmp_path)).splitlines()
-    assert [line.split(":")[1].strip() for line in told] == ["instrument.channels.width", "bogus"]
-    assert not (tmp_path / "store").exists()
-    assert not (tmp_path / "runs").exists()
+def test_all_faults_of_a_file_are_told_on_standard_error(here, capsys):
+    (here / "bad.yaml").write_text("{name: bad, bogus: 1, instrument: {channels: {width: 80}}}")
+    status, told = run_command(capsys, "run", "bad.yaml")
+    assert status == 2
+    assert [line.split(":")[1].strip() for line in told.splitlines()] == ["instrument.channels.width", "bogus"]
+    assert not (here / "store").exists()
+    assert not (here / "runs").exists()
 
 
 @pytest.mark.parametrize(
@@ -174,13 +194,12 @@ def test_a_crash_of_a_library_shows_on_the_terminal_where_it_was(tmp_path):
     assert "in crash" in result.stderr
 
 
-def test_a_plan_computes_and_writes_nothing(tmp_path):
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
-    result = calstudy("plan", "tiny.yaml", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "simulate-chunk" in result.stdout
-    assert "stand-in: sky: G4Jy" in result.stdout
-    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+def test_a_plan_computes_and_writes_nothing(here, capsys):
+    (here / "tiny.yaml").write_text(yaml.safe_dump(tiny(here)))
+    told = plan_of(capsys, "tiny.yaml")
+    assert "simulate-chunk" in told
+    assert "stand-in: sky: G4Jy" in told
+    assert [path.name for path in here.iterdir()] == ["tiny.yaml"]
 
 
 def products_by_stage(plan: str) -> dict[str, str]:
@@ -188,36 +207,34 @@ def products_by_stage(plan: str) -> dict[str, str]:
     return {row[1].strip(): row[2].strip() for row in rows}
 
 
-def test_a_plan_of_a_sweep_counts_what_its_points_share_once(tmp_path):
+def test_a_plan_of_a_sweep_counts_what_its_points_share_once(here, capsys):
     sweep = {"calibration.basis.buffer": ["50 ns", "100 ns", "200 ns"]}
-    data = override({**tiny(tmp_path), "sweep": sweep}, "outputs.figures", ["layout"])
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(data))
-    result = calstudy("plan", "tiny.yaml", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    counts = products_by_stage(result.stdout)
+    data = override({**tiny(here), "sweep": sweep}, "outputs.figures", ["layout"])
+    (here / "tiny.yaml").write_text(yaml.safe_dump(data))
+    told = plan_of(capsys, "tiny.yaml")
+    counts = products_by_stage(told)
     # The figures are one layout for all points, and that of the sweep.
     assert (counts["simulate"], counts["transfer"], counts["figure"]) == ("2", "3", "2")
-    assert result.stdout.count("run folder: ") == 4
+    assert told.count("run folder: ") == 4
 
 
-def test_a_plan_of_a_collection_counts_what_its_members_share_once(tmp_path):
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(of_the_paper(tmp_path)))
+def test_a_plan_of_a_collection_counts_what_its_members_share_once(here, capsys):
+    (here / "tiny.yaml").write_text(yaml.safe_dump(of_the_paper(here)))
     members = ["tiny.yaml", {"file": "tiny.yaml", "name": "louder", "overrides": {"corruption.noise.factor": 5}}]
-    (tmp_path / "both.yaml").write_text(yaml.safe_dump({"name": "both", "experiments": members}))
-    result = calstudy("plan", "both.yaml", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    counts = products_by_stage(result.stdout)
+    (here / "both.yaml").write_text(yaml.safe_dump({"name": "both", "experiments": members}))
+    told = plan_of(capsys, "both.yaml")
+    counts = products_by_stage(told)
     # Claims of each, and of both together.
     assert (counts["simulate"], counts["gains"], counts["claims"]) == ("2", "1", "3")
-    assert result.stdout.count("run folder: ") == 3
+    assert told.count("run folder: ") == 3
 
 
-def test_claims_of_what_is_no_run_are_refused(tmp_path):
-    assert "not the folder of a finished run" in refused(calstudy("claims", ".", cwd=tmp_path))
-
-
-def test_a_report_of_what_is_no_run_is_refused(tmp_path):
-    assert "not the folder of a finished run" in refused(calstudy("report", ".", cwd=tmp_path))
+@pytest.mark.parametrize("command", ["claims", "report"])
+def test_what_is_no_run_is_refused(here, capsys, command):
+    status, told = run_command(capsys, command, ".")
+    assert status == 2
+    assert told.count("\n") == 1
+    assert "not the folder of a finished run" in told
 
 
 def test_one_section_of_the_reference_has_its_fields_and_those_of_the_sections_inside(capsys):

@@ -28,8 +28,9 @@ STUDY = {
 
 
 @pytest.fixture(scope="module")
-def figures(tmp_path_factory):
+def figures(tmp_path_factory, shared_store):
     folder = tmp_path_factory.mktemp("convergence")
+    (folder / "store").symlink_to(shared_store)
     # Weights that stay as they are, so that losses of all steps compare.
     data = override({**tiny(folder), "variants": VARIANTS}, "calibration.weights", "flags")
     data = override(data, "outputs.figures", ["convergence", "expected-loss"])

@@ -18,8 +18,9 @@ from calstudy.results.reader import RunFolder
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory):
+def file(tmp_path_factory, shared_store):
     folder = tmp_path_factory.mktemp("interface")
+    (folder / "store").symlink_to(shared_store)
     path = folder / "tiny.yaml"
     path.write_text(yaml.safe_dump(tiny(folder)))
     return path

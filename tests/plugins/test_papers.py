@@ -71,7 +71,7 @@ def test_its_statements_are_judged_as_they_come_out(folder):
 
 def test_an_installed_one_is_used_by_its_name_and_beside_others(folder, monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "hexagons_package", CODE, "calstudy.papers: hexagons = hexagons_package", "1.0")
-    run, _ = run_of(folder, "hexagons", "calamity2022", calibration={"chunks": 2, "weights": "flags"})
+    run, _ = run_of(folder, "hexagons", "calamity2022")
     found = verdicts(run.folder)
     assert {name: found[name] for name in VERDICTS} == VERDICTS
     assert found["redundant-signal-recovered"] != "not evaluated"

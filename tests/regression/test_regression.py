@@ -40,8 +40,10 @@ FIGURES = ["layout", "gains", "data", "wedge", "spherical"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("regression")
+def folder(tmp_path_factory, shared_store) -> Path:
+    folder = tmp_path_factory.mktemp("regression")
+    (folder / "store").symlink_to(shared_store)
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-DRAWN = {"realizations": [{"draw": ["noise"], "count": 2}], "papers": []}
+NOISES = {"realizations": [{"draw": ["noise"], "count": 2}], "papers": []}
 PAIR = {
     "name": "pair",
     "experiments": [
@@ -56,8 +56,10 @@ def write(folder: Path, **changes) -> Path:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("collection")
+def folder(tmp_path_factory, shared_store) -> Path:
+    folder = tmp_path_factory.mktemp("collection")
+    (folder / "store").symlink_to(shared_store)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -304,7 +306,7 @@ def test_other_results_in_the_store_are_not_passed_off_as_those_of_the_run(finis
 def test_a_member_of_which_more_than_tables_is_needed_is_run(finished, folder, tmp_path):
     text = io.StringIO()
     path = write(
-        folder, figures=[], experiments=["hex.yaml", {"file": "hex.yaml", "name": "drawn", "overrides": DRAWN}]
+        folder, figures=[], experiments=["hex.yaml", {"file": "hex.yaml", "name": "drawn", "overrides": NOISES}]
     )
     changes = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
     taken = with_finished(load_study(path, overrides=changes), [finished.folder.parent], Console(file=text, width=300))
