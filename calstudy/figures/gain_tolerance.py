@@ -44,9 +44,10 @@ PUBLISHED = (
     Published(0.001, "Tripathi et al. 2025"),
     Published(0.01, "Mazumder et al. 2022"),
     Published(0.1, "Mdlalose 2018"),
+    Published(0.5, "Trott & Wayth 2016"),
     Published(1.0, "Beohar et al. 2026"),
 )
-"""Tolerances of gains from abstracts; the second as Beohar et al. quote it, the third as Mdlalose does."""
+"""Tolerances of gains from abstracts, of which the second is quoted by Beohar et al., and the third from others."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,10 @@ def tolerated(law: GainBias, bias: np.ndarray, error: np.ndarray) -> Tolerated:
     """Return the rms that is tolerated, from the bias that was measured and its standard deviation, (Nk,) each."""
     known = bias > SIGMAS * error
     limits = np.array([upper_limit(*pair) for pair in zip(bias, error, strict=True)])
-    # The two terms of the law keep their ratio.
+    # The two terms of the law keep their ratio; without a law, the bias goes with the variance.
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = np.where(known, bias, limits) / law.bias
-        sigma = tolerated_sigma(law.terms * scale, LIMIT)
+        shares = np.where(law.bias > 0, law.terms / law.bias, [[law.sigma**-2], [0.0]])
+        sigma = tolerated_sigma(shares * np.where(known, bias, limits), LIMIT)
         spread = np.where(known, sigma * error / (2 * np.abs(bias)), np.nan)
     return Tolerated(law, bias, error, sigma, spread)
 

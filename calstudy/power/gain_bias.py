@@ -13,6 +13,9 @@ The expected power is that of the foregrounds convolved in delay with the delay 
 realizations have the same gains, and each power has the same expectation, so that averaging powers over baselines and
 blocks of time reduces nothing. The coherent average over a block multiplies R by its mean over pairs of integrations.
 This takes the foregrounds, fringe-stopped, for constant during a block.
+
+Spectra at as many delays as channels hold the correlation of the foregrounds at a separation together with that at the
+rest of the band, of which the taper leaves a few per cent at half the band. The covariance must have fallen by there.
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ class GainBias:
     length, time, common : correlation length and time (NaN: constant), and the part that antennas share
     form : of the correlation in frequency
     bin_edges : of the bands, (Nk + 1,)
-    bias : over the EoR, (Nk,)
+    bias : over the EoR, (Nk,); NaN for errors that are correlated over the band
     terms : factors of sigma^2 and sigma^4 in it, (2, Nk)
     lengths : other correlation lengths, ascending, (Nl,)
     terms_at : the same factors for these, (Nl, 2, Nk)
@@ -74,6 +77,10 @@ class GainBias:
     terms_at: np.ndarray = field(metadata={"unit": ""})
 
 
+FALLEN = 1e-4
+"""Largest covariance of smooth errors, over the variance, at a separation of half the band."""
+
+
 def exponential(count: int, integration: float, time: float | None) -> np.ndarray:
     """Return R = exp(-t / time) between `count` integrations, (count, count); 1 if `time` is None. Both are in s."""
     if time is None:
@@ -86,7 +93,6 @@ def added_power(foregrounds: DelaySpectra, errors: ErrorCovariance) -> np.ndarra
     """Return the factors of v and v^2 in the expected power, (2, Nu, Nd), in the unit of the foregrounds' power."""
     n = foregrounds.delay.size
     lag = np.arange(n)
-    # The product of two periodic sequences; separations beyond half the band are in the taper's faint ends.
     channels = errors.channels[np.minimum(lag, n - lag)]
     # In the order of the delays, zero is in the middle.
     lags = np.fft.fft(np.fft.ifftshift(foregrounds.power.real, axes=1), axis=1)

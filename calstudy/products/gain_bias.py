@@ -64,7 +64,7 @@ class ExpectGainBias(Task, stage="gain-bias", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the expected bias to gain-bias.h5."""
-        from calstudy.power.gain_bias import ErrorCovariance, GainBias, bias_terms, exponential
+        from calstudy.power.gain_bias import FALLEN, ErrorCovariance, GainBias, bias_terms, exponential
         from calstudy.power.spectra import of_common_units
         from calstudy.power.tables import save_spectrum
 
@@ -78,6 +78,9 @@ class ExpectGainBias(Task, stage="gain-bias", version=1):
 
         def terms(correlated: Correlated) -> np.ndarray:
             errors = ErrorCovariance(correlated.correlation(separations), in_time, effect.common)
+            # The tail of an exponential is far above what is neglected.
+            if correlated.form == "gaussian" and errors.channels[len(separations) // 2] > FALLEN:
+                return np.full((2, len(BANDS) - 1), np.nan)
             return bias_terms(**parts, errors=errors, edges=BANDS, buffer=self.power.wedge_buffer)
 
         lengths = np.geomspace(width / 2, width * self.channels.count, LENGTHS)

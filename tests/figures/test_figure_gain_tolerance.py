@@ -37,6 +37,12 @@ def test_the_tolerated_rms_is_that_of_the_measurement_or_a_lower_limit():
     assert np.isnan(found.sigma_error[2])
 
 
+def test_without_a_law_the_bias_goes_with_the_variance():
+    unknown = replace(LAW, bias=np.full(3, np.nan), terms=np.full((2, 3), np.nan))
+    error = np.array([20.0, 2.0, 0.04])
+    assert tolerated(unknown, BIAS, error).sigma == pytest.approx(tolerated(LAW, BIAS, error).sigma)
+
+
 def test_points_of_the_measurement_stand_beside_the_lines_of_the_law():
     error = np.array([20.0, 2.0, 0.04])
     worlds = {
