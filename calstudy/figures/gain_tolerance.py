@@ -104,7 +104,7 @@ def draw_gain_tolerance(worlds: Mapping[str, Tolerated], eor_level: float | None
             axes.axhline(published.percent, color=style.GREY, linewidth=0.7, linestyle=":", zorder=0)
         _scale(axes, [found.law for found in worlds.values()])
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
-    _name_published(panels[0])
+    _name_published(panels[-1])
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB"
     panels[0].set_ylabel(f"rms for a bias of {LIMIT:g} (%){level}")
     handles = [Line2D([], [], **_look(kind, number), label=_title(kind)) for number, kind in enumerate(kinds)]
@@ -144,12 +144,14 @@ def _draw_kind(axes: Axes, members: Sequence[Tolerated], band: int, number: int)
     law = members[0].law
     look = _look(_kind(law), number)
     curve = 100 * tolerated_sigma(law.terms_at[:, :, band].T, LIMIT)
-    axes.plot(law.lengths / 1e6, curve, color=look["color"], linestyle=look["linestyle"], linewidth=0.8, zorder=1)
+    # Lines that coincide show the first.
+    line = {"color": look["color"], "linewidth": 0.8, "zorder": 1 - 0.01 * number}
+    axes.plot(law.lengths / 1e6, curve, linestyle=look["linestyle"], **line)
     for found in members:
         at = _place(found.law)
         expected = 100 * float(tolerated_sigma(found.law.terms[:, band], LIMIT))
         if found.law.length == 0:
-            axes.plot(np.array([0.8, 1.25]) * at, [expected] * 2, color=look["color"], linewidth=0.8, zorder=1)
+            axes.plot(np.array([0.8, 1.25]) * at, [expected] * 2, **line)
         point = look | {"linestyle": "", "zorder": 2}
         sigma, error = 100 * found.sigma[band], 100 * found.sigma_error[band]
         if np.isfinite(error):
@@ -174,10 +176,18 @@ def _scale(axes: Axes, laws: Sequence[GainBias]) -> None:
 
 
 def _name_published(axes: Axes) -> None:
-    right = axes.get_xlim()[1]
+    """Name the dotted lines on the left of a panel, the lowest from below."""
+    left, lowest = axes.get_xlim()[0], min(published.percent for published in PUBLISHED)
     for published in PUBLISHED:
-        text = f"{published.source}: {published.percent:g} %"
-        axes.text(right * 0.9, published.percent * 1.1, text, size=style.NOTE_SIZE, color=style.GREY, ha="right")
+        below = published.percent == lowest
+        axes.text(
+            1.15 * left,
+            published.percent * (0.93 if below else 1.05),
+            f"{published.source}: {published.percent:g} %",
+            size=style.NOTE_SIZE,
+            color=style.GREY,
+            va="top" if below else "bottom",
+        )
 
 
 class GainTolerance(StudyFigure):
