@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from scipy.spatial.distance import pdist
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.paths import differences
 from calstudy.calibrate.settings import WeightedFit
-from calstudy.corrupt.drift import Delays
+from calstudy.corrupt.drift import Correlated, Delays
 from calstudy.corrupt.effects.gains import Bandpass
 from calstudy.corrupt.interface import GainEffect
 from calstudy.experiment.assumed import assumed_changes
@@ -41,10 +42,19 @@ def other_calibrator(experiment: Experiment, allowed: Sequence[str]) -> str | No
 def structured_gains(experiment: Experiment) -> str | None:
     """Return in words which gains are not smooth in frequency, or None if all are."""
     for effect in experiment.corruption.effects:
-        rough = isinstance(effect, Bandpass) and isinstance(effect.shape, Delays) and effect.shape.max_delay > SMOOTH
-        if isinstance(effect, GainEffect) and (rough or not isinstance(effect, Bandpass)):
+        if isinstance(effect, GainEffect) and not (isinstance(effect, Bandpass) and _is_smooth(effect)):
             return f"corruption.effects has {effect.label}, whose gains are not smooth in frequency"
     return None
+
+
+def _is_smooth(effect: Bandpass) -> bool:
+    shape = effect.shape
+    if isinstance(shape, Delays):
+        return shape.max_delay <= SMOOTH
+    if isinstance(shape, Correlated):
+        # The delay spectrum is a Gaussian of this standard deviation.
+        return shape.form == "gaussian" and 2 / (2 * math.pi * SMOOTH) <= shape.length
+    return True
 
 
 def other_weights(experiment: Experiment) -> str | None:

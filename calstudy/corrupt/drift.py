@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.schema import Section, choice
-from calstudy.base.units import Delay, Phase, Time
+from calstudy.base.units import Delay, Frequency, Phase, Time
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
@@ -48,20 +48,48 @@ class Delays(_Shape):
 
     def components(self, frequencies: np.ndarray) -> np.ndarray:
         """Return the symmetric root of the covariance sin(2 pi tau nu) / (2 pi tau nu) between channels."""
-        covariance = np.sinc(2 * self.max_delay * (frequencies[:, None] - frequencies))
-        values, vectors = np.linalg.eigh(covariance)
-        # Unlike the eigenvectors, whose signs and order are arbitrary, the root is unique.
-        return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+        return _symmetric_root(np.sinc(2 * self.max_delay * (frequencies[:, None] - frequencies)))
 
 
-Shape = Annotated[Polynomial | Delays, choice("kind", "polynomial")]
+class Correlated(_Shape):
+    """A Gaussian process with a correlation that falls with the separation in frequency."""
+
+    kind: Literal["correlated"]
+    length: Frequency = Field(
+        1e6, ge=0, description="Correlation length; 0: channels are independent, whatever their width."
+    )
+    form: Literal["gaussian", "exponential"] = Field(
+        "gaussian",
+        description="Correlation at the separation nu: exp(-nu^2 / (2 length^2)), or exp(-|nu| / length), whose delay "
+        "spectrum has a tail as 1 / delay^2.",
+    )
+
+    def correlation(self, separations: np.ndarray) -> np.ndarray:
+        """Return the correlation at separations in Hz, float64, of the same shape."""
+        if self.length == 0:
+            return (separations == 0).astype(float)
+        ratio = np.abs(separations) / self.length
+        return np.exp(-(ratio**2) / 2 if self.form == "gaussian" else -ratio)
+
+    def components(self, frequencies: np.ndarray) -> np.ndarray:
+        """Return the symmetric root of the covariance between channels."""
+        return _symmetric_root(self.correlation(frequencies[:, None] - frequencies))
+
+
+def _symmetric_root(covariance: np.ndarray) -> np.ndarray:
+    """Return the symmetric root of a covariance; unlike eigenvectors, of arbitrary signs and order, it is unique."""
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+
+
+Shape = Annotated[Polynomial | Delays | Correlated, choice("kind", "polynomial")]
 
 
 SECONDS_PER_DAY = 86400
 
 
 Antennas = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
-Channels = Annotated[Literal["common", "independent"] | Polynomial | Delays, choice("kind", "polynomial")]
+Channels = Annotated[Literal["common", "independent"] | Polynomial | Delays | Correlated, choice("kind", "polynomial")]
 
 
 class _Drift(Section, ABC):

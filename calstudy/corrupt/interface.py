@@ -109,6 +109,11 @@ class GainEffect(Effect):
         reason = None if self.drift is None else refusal_of_antennas(self.drift.antennas, size.antennas)
         return None if reason is None else f"drift.antennas: {reason}"
 
+    @property
+    def varies(self) -> bool:
+        """True if the gains change during the run; a subclass whose own gains do says so, for the plan."""
+        return self.drift is not None
+
     @abstractmethod
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, complex, shape (Nants, Nfreqs, 1 or Ntimes, Npols), without the drift.

@@ -12,12 +12,21 @@ import numpy as np
 
 from calstudy.base.table import Table
 from calstudy.power.expected import ExpectedBins
+from calstudy.power.gain_bias import GainBias
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.transfer import TransferFunction, TransferMap
 
 Spectrum = TypeVar(
-    "Spectrum", DelaySpectra, SphericalSpectrum, CylindricalSpectrum, TransferFunction, TransferMap, ExpectedBins, Score
+    "Spectrum",
+    DelaySpectra,
+    SphericalSpectrum,
+    CylindricalSpectrum,
+    TransferFunction,
+    TransferMap,
+    ExpectedBins,
+    GainBias,
+    Score,
 )
 
 CSV_COLUMNS = {

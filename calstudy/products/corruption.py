@@ -335,6 +335,6 @@ class Autocorrelate(Task, stage="autocorrelations", version=1):
 def _cost_of_gains(task: Task, effects: Sequence[Effect]) -> Cost:
     """Return the cost of gains, whose number depends on antennas, channels and, if they drift, integrations."""
     size = size_of(task)
-    times = size.times if any(getattr(effect, "drift", None) is not None for effect in effects) else 1
+    times = size.times if any(isinstance(effect, GainEffect) and effect.varies for effect in effects) else 1
     disk = size.antennas * size.channels.count * times * size.polarizations * COMPLEX128
     return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, 1e6 + disk)

@@ -204,6 +204,9 @@ def test_known_beams_are_the_true_ones(assumed, accepted):
         ("nsamples", "{kind: per-channel-gains}", False),
         ("flags", "{kind: bandpass}", True),
         ("flags", "{kind: bandpass, shape: {kind: delays, max_delay: 1000 ns}}", False),
+        ("flags", "{kind: bandpass, shape: {kind: correlated, length: 4 MHz}}", True),
+        ("flags", "{kind: bandpass, shape: {kind: correlated, length: 1 MHz}}", False),
+        ("flags", "{kind: bandpass, shape: {kind: correlated, length: 4 MHz, form: exponential}}", False),
         ("flags", "{kind: bandpass}, {kind: reflection-gains}", False),
     ],
 )

@@ -42,6 +42,7 @@ OTHER: dict[str, list[Any]] = {
     "DipoleErrors.dead": [{"set": {"antennas": [0], "x": [1]}}],
     "BeamErrors.swapped": [[0]],
     "DeadAntennas.antennas": [[1]],
+    "Bandpass.time": ["1 min"],
     "_Drift.antennas": [[1]],
     "Swing.antennas": [[1]],
     "RadiometerNoise.seeds": [[5, 6]],

@@ -49,7 +49,10 @@ class PerChannelGains(GainEffect):
 
 
 class Bandpass(GainEffect):
-    """g = 1 + sigma (x + i y), with x and y smooth in frequency, of unit variance, independent for every antenna."""
+    """g = 1 + sigma (x + i y), with x and y of unit variance and correlated in frequency.
+
+    They are independent for every antenna, but for the part that all share, and constant or correlated in time.
+    """
 
     version: ClassVar[int] = 2
 
@@ -62,14 +65,40 @@ class Bandpass(GainEffect):
         "choice of this project.",
     )
     shape: Shape = Polynomial(kind="polynomial")
+    time: Time | None = Field(
+        None, gt=0, description="Correlation time of x and y, whose correlation is exp(-t / time); null: constant."
+    )
+    common: Fraction = Field(0.0, ge=0, le=1, description="Part of the variance of x and y that all antennas share.")
     seed: int = Field(11, ge=0, description="Seed of x and y.")
 
+    @property
+    def varies(self) -> bool:
+        """True if the gains change during the run."""
+        return self.time is not None or super().varies
+
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
-        """Return the gains, shape (Nants, Nfreqs, 1, Npols), with an independent draw for every polarization."""
+        """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols), with a draw for every polarization."""
         components = self.shape.components(observation.frequencies)
-        shape = observation.n_antennas, observation.n_polarizations, components.shape[1]
-        real, imaginary = random.standard_normal((2, *shape)) @ components.T
-        return np.moveaxis(1 + self.sigma * (real + 1j * imaginary), 2, 1)[:, :, None]
+        deviations = self._drawn(observation.n_antennas, components, observation, random)
+        if self.common > 0:
+            shared = self._drawn(1, components, observation, random)
+            deviations = np.sqrt(1 - self.common) * deviations + np.sqrt(self.common) * shared
+        real, imaginary = deviations
+        return np.moveaxis(1 + self.sigma * (real + 1j * imaginary), (0, 1, 2, 3), (2, 0, 3, 1))
+
+    def _drawn(
+        self, count: int, components: np.ndarray, observation: Observation, random: np.random.Generator
+    ) -> np.ndarray:
+        """Return x and y of `count` antennas, (2, 1 or Ntimes, Nants, Npols, Nfreqs)."""
+        times = 1 if self.time is None else observation.n_times
+        shape = 2, times, count, observation.n_polarizations, components.shape[1]
+        drawn = random.standard_normal(shape)
+        if self.time is not None:
+            # An autoregressive process of first order: each integration keeps a part of the one before.
+            kept = np.exp(-np.diff(observation.times) * SECONDS_PER_DAY / self.time)
+            for place, part in enumerate(kept, start=1):
+                drawn[:, place] = part * drawn[:, place - 1] + np.sqrt(1 - part**2) * drawn[:, place]
+        return drawn @ components.T
 
 
 class Swing(Section):
@@ -107,6 +136,11 @@ class ReflectionGains(GainEffect):
         """Refuse changes of antennas that do not exist."""
         reason = None if self.swing is None else refusal_of_antennas(self.swing.antennas, size.antennas)
         return super().refusal(size) if reason is None else f"swing.antennas: {reason}"
+
+    @property
+    def varies(self) -> bool:
+        """True if the gains change during the run."""
+        return self.swing is not None or super().varies
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols), with an independent draw for every polarization.

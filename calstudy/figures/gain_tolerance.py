@@ -1,0 +1,217 @@
+"""How exact must gains be? The rms at which their errors cause a bias of a tenth of the EoR, measured and by a law."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from calstudy.base.constants import SIGMAS_95
+from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.comparison import COLOURS, MARKERS
+from calstudy.plotting import style
+from calstudy.power.gain_bias import GainBias, tolerated_sigma
+from calstudy.products.comparison import case_name, read_cases
+from calstudy.products.gain_bias import gain_bias, read_gain_bias
+from calstudy.products.graph import required
+from calstudy.products.score import score
+from calstudy.products.tolerances import LIMIT, SIGMAS, upper_limit
+from calstudy.run.task import Job, Task
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from calstudy.products.graph import Graph
+
+HEIGHT = 3.6
+LOWEST, HIGHEST = 3e-4, 100.0
+"""Limits of the rms, %."""
+WHITE = 0.4
+"""Where errors without correlation are drawn, over the shortest correlation length of the law."""
+
+
+class Published(NamedTuple):
+    """A published tolerance, in %, and where it was read."""
+
+    percent: float
+    source: str
+
+
+PUBLISHED = (
+    Published(0.001, "Tripathi et al. 2025"),
+    Published(0.01, "Mazumder et al. 2022"),
+    Published(0.1, "Mdlalose 2018"),
+    Published(0.5, "Trott & Wayth 2016"),
+    Published(1.0, "Beohar et al. 2026"),
+)
+"""Tolerances of gains from abstracts, of which the second is quoted by Beohar et al., and the third from others."""
+
+
+@dataclass(frozen=True)
+class Tolerated:
+    """The law of a world, and the rms in it that causes a bias of `LIMIT`, in Nk bands of k.
+
+    Attributes
+    ----------
+    law : what is expected
+    bias, bias_error : as measured, (Nk,)
+    sigma, sigma_error
+        The rms that is tolerated by the measurement, with the scaling of the law, and its standard deviation, (Nk,);
+        the error is NaN where the bias is not significant, and the rms a lower limit.
+    """
+
+    law: GainBias
+    bias: np.ndarray
+    bias_error: np.ndarray
+    sigma: np.ndarray
+    sigma_error: np.ndarray
+
+
+def tolerated(law: GainBias, bias: np.ndarray, error: np.ndarray) -> Tolerated:
+    """Return the rms that is tolerated, from the bias that was measured and its standard deviation, (Nk,) each."""
+    known = bias > SIGMAS * error
+    limits = np.array([upper_limit(*pair) for pair in zip(bias, error, strict=True)])
+    # The two terms of the law keep their ratio; without a law, the bias goes with the variance.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(law.bias > 0, law.terms / law.bias, [[law.sigma**-2], [0.0]])
+        sigma = tolerated_sigma(shares * np.where(known, bias, limits), LIMIT)
+        spread = np.where(known, sigma * error / (2 * np.abs(bias)), np.nan)
+    return Tolerated(law, bias, error, sigma, spread)
+
+
+@style.journal_style()
+def draw_gain_tolerance(worlds: Mapping[str, Tolerated], eor_level: float | None = None) -> Figure:
+    """Draw the tolerated rms against the correlation length, a panel for each band of k: points on lines of the law.
+
+    Colours are correlation times, dashed lines an exponential correlation, open symbols errors that antennas have in
+    common in part, arrows lower limits. Dotted lines are published tolerances. `eor_level` is that of the EoR in dB,
+    None if not known.
+    """
+    from matplotlib.lines import Line2D
+
+    edges = next(iter(worlds.values())).law.bin_edges
+    figure = style.new_figure(style.TWO_COLUMNS, HEIGHT)
+    panels = figure.subplots(1, edges.size - 1, squeeze=False, sharex=True, sharey=True)[0]
+    kinds = list(dict.fromkeys(_kind(found.law) for found in worlds.values()))
+    for band, axes in enumerate(panels):
+        for number, kind in enumerate(kinds):
+            members = [found for found in worlds.values() if _kind(found.law) == kind]
+            _draw_kind(axes, members, band, number)
+        for published in PUBLISHED:
+            axes.axhline(published.percent, color=style.GREY, linewidth=0.7, linestyle=":", zorder=0)
+        _scale(axes, [found.law for found in worlds.values()])
+        axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
+    _name_published(panels[-1])
+    level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB"
+    panels[0].set_ylabel(f"rms for a bias of {LIMIT:g} (%){level}")
+    handles = [Line2D([], [], **_look(kind, number), label=_title(kind)) for number, kind in enumerate(kinds)]
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 4))
+    return figure
+
+
+Kind = tuple[float | None, str, float]
+
+
+def _kind(law: GainBias) -> Kind:
+    """Return correlation time, form and common part, which tell the lines apart."""
+    return None if np.isnan(law.time) else law.time, law.form, law.common
+
+
+def _title(kind: Kind) -> str:
+    time, form, common = kind
+    words = ["constant" if time is None else f"{time:g} s"]
+    words += ["exponential"] if form == "exponential" else []
+    words += [f"{100 * common:g} % common"] if common else []
+    return ", ".join(words)
+
+
+def _look(kind: Kind, number: int) -> dict[str, Any]:
+    _, form, common = kind
+    colour = COLOURS[number % len(COLOURS)]
+    return {
+        "color": colour,
+        "marker": MARKERS[number % len(MARKERS)],
+        "markerfacecolor": "white" if common else colour,
+        "linestyle": "--" if form == "exponential" else "-",
+        "linewidth": 0.8,
+    }
+
+
+def _draw_kind(axes: Axes, members: Sequence[Tolerated], band: int, number: int) -> None:
+    law = members[0].law
+    look = _look(_kind(law), number)
+    curve = 100 * tolerated_sigma(law.terms_at[:, :, band].T, LIMIT)
+    # Lines that coincide show the first.
+    line = {"color": look["color"], "linewidth": 0.8, "zorder": 1 - 0.01 * number}
+    axes.plot(law.lengths / 1e6, curve, linestyle=look["linestyle"], **line)
+    for found in members:
+        at = _place(found.law)
+        expected = 100 * float(tolerated_sigma(found.law.terms[:, band], LIMIT))
+        if found.law.length == 0:
+            axes.plot(np.array([0.8, 1.25]) * at, [expected] * 2, **line)
+        point = look | {"linestyle": "", "zorder": 2}
+        sigma, error = 100 * found.sigma[band], 100 * found.sigma_error[band]
+        if np.isfinite(error):
+            axes.errorbar(at, sigma, yerr=SIGMAS_95 * error, elinewidth=0.6, **point)
+        else:
+            axes.errorbar(at, min(sigma, HIGHEST), yerr=0.4 * sigma, lolims=True, elinewidth=0.6, **point)
+
+
+def _place(law: GainBias) -> float:
+    """Return the place of a correlation length on the axis, MHz."""
+    return (law.length or WHITE * float(law.lengths[0])) / 1e6
+
+
+def _scale(axes: Axes, laws: Sequence[GainBias]) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(LOWEST, HIGHEST)
+    ticks = sorted({_place(law): law.length / 1e6 for law in laws}.items())
+    axes.set_xticks([place for place, _ in ticks], [f"{length:g}" for _, length in ticks])
+    axes.set_xticks([], minor=True)
+    axes.set_xlabel("correlation length (MHz)")
+
+
+def _name_published(axes: Axes) -> None:
+    """Name the dotted lines on the left of a panel, the lowest from below."""
+    left, lowest = axes.get_xlim()[0], min(published.percent for published in PUBLISHED)
+    for published in PUBLISHED:
+        below = published.percent == lowest
+        axes.text(
+            1.15 * left,
+            published.percent * (0.93 if below else 1.05),
+            f"{published.source}: {published.percent:g} %",
+            size=style.NOTE_SIZE,
+            color=style.GREY,
+            va="top" if below else "bottom",
+        )
+
+
+class GainTolerance(StudyFigure):
+    """The rms of gain errors at which the bias is a tenth of the EoR, against their correlation in frequency."""
+
+    of = ("comparison",)
+
+    kind: str = "gain-tolerance"
+    caption = (
+        "The rms of the real part of gain errors at which their bias is a tenth of the EoR, if nothing is calibrated: "
+        "measured (points, 95 % bars; arrows: lower limits) and by the law (lines). Dotted: published tolerances."
+    )
+    sections = ("corruption.eor_level",)
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the scores of one case and its law; raises InputError if the law is not of its effects."""
+        return {"": required(score(graph)), "law": gain_bias(graph)}
+
+    def draw(self, job: Job) -> Drawing:
+        """Draw the first calibrator, which must not change the data, in all worlds."""
+        first, *_ = job.settings["calibrators"]
+        worlds = {}
+        for row, (world, found) in enumerate(read_cases([first], job.settings["worlds"], job.inputs).items()):
+            bands = found[first].bands
+            law = read_gain_bias(job.inputs[f"law:{case_name(row, 0)}"])
+            worlds[world] = tolerated(law, bands.bias, bands.bias_error)
+        return Drawing(draw_gain_tolerance(worlds, job.settings.get("eor_level")), worlds)
