@@ -49,6 +49,10 @@ def test_losses_are_uniform_and_their_size_scales_one_draw():
     assert found.shape == (217, 100)
     assert found.mean() == pytest.approx(0.01, abs=0.02 * 4 / np.sqrt(12 * found.size))
     assert found.std() == pytest.approx(0.02 / np.sqrt(12), rel=0.02)
+    rare = draw_truth(Decoherence(loss=0.02, chance=0.1, per_board=1, block="240 kHz"), many)["p"]
+    np.testing.assert_array_equal(rare[rare > 0], found[rare > 0])
+    # A share of N is known to sqrt(p (1 - p) / N).
+    assert (rare > 0).mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / found.size))
     larger = draw_truth(Decoherence(loss=0.2, per_board=1, block="240 kHz"), many)["p"]
     np.testing.assert_allclose(larger, 10 * found, rtol=1e-12)
 

@@ -33,6 +33,7 @@ class Decoherence(Effect):
         description="Largest loss p, which is uniform from 0 for every board and block; HERA calls an antenna suspect "
         "above the default.",
     )
+    chance: Fraction = Field(1.0, gt=0, le=1, description="Chance of a board to lose anything in a block.")
     per_board: int = Field(
         3, ge=1, description="How many consecutive antennas of the layout share a board; the default is HERA's."
     )
@@ -65,7 +66,9 @@ class Decoherence(Effect):
         """Return the loss p of every board and block, (Nboards, Nblocks), and the board of every antenna, (Nants,)."""
         boards = np.arange(observation.n_antennas) // self.per_board
         blocks = -(-observation.n_channels // channels_per_block(observation.frequencies, self.block))
-        return {"p": self.loss * random.uniform(size=(boards[-1] + 1, blocks)), "board": boards}
+        shape = (boards[-1] + 1, blocks)
+        losses = self.loss * random.uniform(size=shape)
+        return {"p": np.where(random.uniform(size=shape) < self.chance, losses, 0), "board": boards}
 
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
         """Return the visibilities times what is left of them."""
