@@ -66,12 +66,17 @@ class Boards(Section):
 
         They become the closure factors of the baselines between boards. Data and sky model have the baselines of the
         calibration, which has flags, an outcome for each solve, and gains as an array (Nants, Nfreqs, Ngroups, Npols).
+        All solves have failed if the estimate does not converge.
         """
         assert isinstance(found.gains, np.ndarray)
         assert found.gain_flags is not None
         assert isinstance(found.outcomes, Sequence)
         gains = np.where(found.gain_flags, np.nan, found.gains)
-        kept = 1 - self._losses(gains, self._information(gains, data, sky, found, groups), data)
+        try:
+            kept = 1 - self._losses(gains, self._information(gains, data, sky, found, groups), data)
+        except RuntimeError as error:
+            told = f"hera_cal finds no losses between boards: {error}"
+            return replace(found, outcomes=[replace(ended, status="failed", message=told) for ended in found.outcomes])
         closure = np.ones(data.shape)
         between = np.flatnonzero(~self.within(data))
         first, second = data.antennas[between].T
@@ -131,7 +136,7 @@ class Boards(Section):
                     full_sigma=1.5 * self.detection,
                     band_split_freq=0.0,
                 )
-        except (ValueError, RuntimeError) as error:
+        except ValueError as error:
             raise InputError(f"calibration.boards: hera_cal finds no losses: {error}") from None
         losses = np.stack([found[board] for board in boards.tolist()])
         by_channel = np.nan_to_num(losses)[:, :, np.arange(frame.n_channels) // channels]
