@@ -168,3 +168,11 @@ def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndar
         resolution=(template.integration_time[0], template.channel_width[0]),
         polarizations=template.polarization_array.copy(),
     )
+
+
+def channels_per_block(frequencies: np.ndarray, width: float) -> int:
+    """Return how many channels, at least one, a block has that is `width` Hz wide; frequencies are in Hz."""
+    if len(frequencies) == 1:
+        return 1
+    channel = (frequencies[-1] - frequencies[0]) / (len(frequencies) - 1)
+    return max(1, round(width / channel))

@@ -249,6 +249,7 @@ class _Returned:
         self.groups = calibrator.solves(observation.n_times)
         self.fitted = observation if returned.baselines is None else observation.baselines(self._chosen(observation))
         self.numbers, self.gains, self.gain_flags = self._gains()
+        self.closure = self._closure()
         self.model = self._model(assumed)
         self.outcomes = self._outcomes()
 
@@ -331,6 +332,20 @@ class _Returned:
         self._require(finite, "returns a model that is not finite for unflagged data")
         return model
 
+    def _closure(self) -> np.ndarray | None:
+        closure = self.returned.closure
+        self._require(
+            closure is None
+            or (
+                isinstance(closure, np.ndarray)
+                and closure.shape == self.fitted.shape
+                and bool(np.isfinite(closure).all() and (closure != 0).all())
+            ),
+            f"returns closure factors of shape {getattr(closure, 'shape', None)}, expected numbers that are finite and "
+            f"not zero, of shape {self.fitted.shape} (integrations, baselines, channels, polarizations)",
+        )
+        return closure
+
     def _outcomes(self) -> list[Solve]:
         outcomes, count = self.returned.outcomes, len(self.groups) * self.fitted.n_polarizations
         outcomes = [outcomes] * count if isinstance(outcomes, Solve) else list(outcomes)
@@ -368,15 +383,16 @@ class _Returned:
             gains = smooth(gains, self.gain_flags, self.fitted, self.numbers, self.calibrator.smooth_gains)
         residual = self._residual(gains, flags)
         template = self.fitted.uvd
+        model = self.model if self.closure is None else self.closure * self.model
         return CalibrationResult(
             make_gains(template, self.numbers, gains, self.gain_flags),
-            make_visibilities(template, self.model, flags),
+            make_visibilities(template, model, flags),
             make_visibilities(template, residual, flags),
             tuple(self._records(usage)),
         )
 
     def _residual(self, gains: np.ndarray, flags: np.ndarray) -> np.ndarray:
-        """Compute V / (g_a g_b*) - F, zero where flagged, and add the flags of the gains to `flags`."""
+        """Compute V / (c_ab g_a g_b*) - F, zero where flagged, and add the flags of the gains to `flags`."""
         residual = np.zeros(self.fitted.shape, complex)
         first, second = np.searchsorted(self.numbers, self.fitted.pairs).T
         for t in range(self.fitted.n_times):
@@ -385,6 +401,8 @@ class _Returned:
                 flags[t, :, :, p] |= flagged[first] | flagged[second]
                 unused = flags[t, :, :, p]
                 products = gains[first, :, t, p] * gains[second, :, t, p].conj()
+                if self.closure is not None:
+                    products = self.closure[t, :, :, p] * products
                 calibrated = np.where(unused, 0, self.fitted.visibilities[t, :, :, p]) / products
                 residual[t, :, :, p] = np.where(unused, 0, calibrated - self.model[t, :, :, p])
         return residual

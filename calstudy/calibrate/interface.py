@@ -76,6 +76,9 @@ class Calibration:
         Samples that are excluded besides the flagged ones, like `model`; None for none.
     baselines
         Mask of the calibrated baselines, bool, (Nbls,); None for all. Model and flags cover only these.
+    closure
+        Factors c of baselines that are no product of gains, V = c_ab g_a g_b* F, real or complex, like `model`; None
+        for one.
     """
 
     gains: np.ndarray | UVCal
@@ -84,6 +87,7 @@ class Calibration:
     model: np.ndarray | None = None
     flags: np.ndarray | None = None
     baselines: np.ndarray | None = None
+    closure: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost, Usage
+from calstudy.calibrate.boards import Boards
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Assumed, Calibration, Progress, Solve
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
@@ -192,6 +193,26 @@ class Skycal(OtherPackage):
     delays: bool = Field(True, description="First fit a delay and a phase per antenna.")
     tolerance: float = Field(1e-8, gt=0, lt=1, description="Stop when no gain of a channel changes by more.")
     max_steps: int = Field(100, ge=1)
+    boards: Boards | None = Field(
+        None,
+        description="Fit gains to baselines between boards, and estimate and correct what is lost between them; null: "
+        "nothing is lost.",
+    )
+
+    def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
+        """Return a sentence also if there are too few boards."""
+        reason = super().refusal(frame, has_sky_model)
+        if reason is not None or self.boards is None:
+            return reason
+        return self.boards.refusal(frame.baselines(~frame.autos))
+
+    def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
+        """Solve every polarization; with boards, correct what they lose."""
+        found = super().calibrate(observation, assumed, progress)
+        if self.boards is None or assumed.sky_model is None:
+            return found
+        data, sky = (each.baselines(~observation.autos) for each in (observation, assumed.sky_model))
+        return self.boards.corrected(found, data, sky, self.solves(data.n_times))
 
     def cost(self, size: Size) -> Cost:
         """Return the cost of the solves: dense matrices of the antennas for each channel, about ten times."""
@@ -203,7 +224,10 @@ class Skycal(OtherPackage):
     def solve(
         self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
     ) -> tuple[np.ndarray, list[Solve]]:
-        """Solve every group of integrations."""
+        """Solve every group of integrations, by the baselines between boards if there are any."""
+        if self.boards is not None:
+            between = ~self.boards.within(measured.frame)[:, None]
+            measured = replace(measured, weights=np.where(between, measured.weights, 0))
         if start is not None:
             measured = measured.weighted_by(start, groups)
         found = [self._solve_group(measured, times) for times in groups]
