@@ -39,7 +39,7 @@ OPTIONS = (
 
 Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format that pyuvdata reads.", show_default=False)]
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
-Gains = Annotated[Path | None, typer.Option(help="CalH5 or calfits file to start from; by default unity.")]
+Gains = Annotated[Path | None, typer.Option(help="File of gains to start from; by default unity.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="YAML file: a `calibration` section.")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default) or adamax.")]
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
@@ -245,7 +245,7 @@ NAME = "gain-comparison"
 MOST_NAMES = 40
 """Largest number of antennas that are named on the axis."""
 
-First = Annotated[Path, typer.Argument(help="Gains, a CalH5 or calfits file.", show_default=False)]
+First = Annotated[Path, typer.Argument(help="Gains, a file of any format of gains.", show_default=False)]
 Second = Annotated[Path, typer.Argument(help="Gains that they are compared with, such as the true ones.")]
 OnlyRedundant = Annotated[
     bool,
@@ -265,15 +265,15 @@ def compare_gains(
     Antennas, feeds and channels that are in one file only are left out. One phase in every channel and one real
     scale are removed in every integration, because no data determine them.
     """
-    from calstudy.base.gains import at_common_channels, read_gains
+    from calstudy.base.gains import at_common_channels, read_gain_pair
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.plotting import style
     from calstudy.plotting.save import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():
-        files = read_gains(first, "the first file"), read_gains(second, "the second file")
-        found = compare_gains(pair_gains(*at_common_channels(*files), feed), redundant)
+        files = at_common_channels(*read_gain_pair(first, second))
+        found = compare_gains(pair_gains(*files, feed), redundant)
     numbers = _numbers(found)
     for name, value in numbers.items():
         typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")

@@ -205,7 +205,7 @@ class DataCalibration(DataStudy):
 
         data, _, notes = observed(self.graph, WHOLE).read()
         if self.start is not None:
-            read_gains(self.start, "calibration.initial_gains.path")
+            read_gains(self.start, "calibration.initial_gains.path", data)
         return [*notes, *conspicuous(Observation(data))]
 
     @property

@@ -202,7 +202,10 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
         (["data.uvh5", "--select", "antennas=3"], "--select antennas: '3' is not in the data"),
         (["data.uvh5", "--buffer", "2000 ns"], "fills all 64 channels"),
         (["data.uvh5", "--set", "autos=true"], "the data hold no autocorrelations"),
-        (["data.uvh5", "--gains", "data.uvh5", *OPTIONS], "not a readable CalH5 or calfits file"),
+        (
+            ["data.uvh5", "--gains", "data.uvh5", *OPTIONS],
+            "not a readable file of CalH5, calfits, H5Parm, hyperdrive or calibrate",
+        ),
     ],
 )
 def test_mistakes_are_one_sentence(command, data, arguments, sentence):
