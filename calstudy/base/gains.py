@@ -13,7 +13,8 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.gain_tables import GainTable, find_reader
+from calstudy.base.gain_formats import find_reader
+from calstudy.base.gain_tables import GainTable
 from calstudy.base.visibilities import antenna_pairs, positions
 
 CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
@@ -43,7 +44,8 @@ def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -
         )
     try:
         return found.uvcal(template)
-    except InputError as error:
+    # pyuvdata refuses axes that disagree, such as times that overlap.
+    except ValueError as error:
         raise InputError(f"{where} = {str(path)!r}: {error}") from None
 
 
@@ -63,7 +65,7 @@ def read_gain_file(path: Path, where: str) -> UVCal | GainTable:
         kind, read = reader
         return read(path)
     # The readers raise the errors of their libraries; the user must correct a file that cannot be read.
-    except (OSError, ValueError, KeyError, IndexError, RuntimeError) as error:
+    except (OSError, ValueError, LookupError, RuntimeError, TypeError, AttributeError) as error:
         raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
 
 

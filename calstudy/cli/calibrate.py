@@ -33,6 +33,7 @@ OPTIONS = (
     (r"--set outputs\.store=DIR", "--output"),
     (r"^output = ", "--output "),
     (r"^expected_loss: ", "--expected-loss: "),
+    (r"^also(\.\d+)?(:| =) ", "--also "),
     (r"`overwrite`", "--overwrite"),
 )
 """Fields of files in messages, and the options of the command that set them."""
@@ -61,7 +62,12 @@ Set = Annotated[
     typer.Option("--set", metavar="FIELD=VALUE", help="Any field of `calibration`: --set basis.min_delay='50 ns'."),
 ]
 Output = Annotated[Path, typer.Option(help="Folder for the results.")]
-Calfits = Annotated[bool, typer.Option("--calfits", help="Also write the gains as calfits.")]
+Also = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FORMAT", help="Also write the gains as calfits, h5 (H5Parm), fits (hyperdrive) or bin (calibrate)."
+    ),
+]
 ExpectedLoss = Annotated[
     bool, typer.Option("--expected-loss", help="Also write the signal loss that the fit is expected to cause.")
 ]
@@ -86,7 +92,7 @@ def calibrate(
     interference: FlagInterference = False,
     overrides: Set = None,
     output: Output = Path("calibrated"),
-    calfits: Calfits = False,
+    also: Also = None,
     gain_errors: GainErrors = True,
     expected_loss: ExpectedLoss = False,
     overwrite: Overwrite = False,
@@ -122,7 +128,7 @@ def calibrate(
             "sky_model": None if sky_model is None else str(sky_model),
         },
         "calibration": _calibration(settings_file, changes),
-        "calfits": calfits,
+        "also": also or [],
         "gain_errors": gain_errors,
         "expected_loss": expected_loss,
     }

@@ -1,6 +1,9 @@
 """Gains of DP3, hyperdrive and calibrate: files that are written here restore the data that they calibrate."""
 
+import os
 import struct
+import subprocess
+from importlib.util import find_spec
 
 import h5py
 import numpy as np
@@ -11,12 +14,15 @@ from test_calamity import make_uvdata
 from toy import complex_normal, make_toy, scattered
 
 from calstudy.base.errors import InputError
+from calstudy.base.gain_formats import write_gains
 from calstudy.base.gains import make_uvcal, read_gain_pair, read_gains
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
+from calstudy.calibrate.calibrators import ddecal
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import starting_gains
+from calstudy.corrupt.effects.gains import FileGains
 
 N_ANTENNAS, N_TIMES, N_SOLUTIONS = 5, 4, 2
 FORMATS = ("gains.bin", "gains.fits", "gains.h5")
@@ -229,6 +235,9 @@ def test_calibrations_start_from_them(world, tmp_path, name):
     WRITERS[name](tmp_path / name, gains[:, :, :1].conj(), data)
     start = starting_gains(Observation(data), read_gains(tmp_path / name, "test", data))
     assert np.allclose(start, gains[:, :, :1].repeat(N_TIMES, axis=2), rtol=1e-12)
+    # Effects on simulated data read them likewise.
+    drawn = FileGains(path=tmp_path / name).gains(Observation(data), np.random.default_rng(0))
+    assert np.allclose(drawn, gains[:, :, :1], rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -262,6 +271,10 @@ def other_names(path, of_file, uvd):
     write_fits(path, of_file, uvd, names=[f"Tile{row}" for row in range(N_ANTENNAS)])
 
 
+def overlapping(path, of_file, uvd):
+    write_fits(path, of_file, uvd, times=seconds(uvd)[0][[0, 2, 1, 3]])
+
+
 def short_table(path, of_file, uvd):
     write_fits(path, of_file[:4], uvd)
 
@@ -289,6 +302,18 @@ def other_axis(file):
     file["sol000/phase000/freq"][3] += 1e6
 
 
+def short_axis(file):
+    for name in ("amplitude000", "phase000"):
+        labels = file[f"sol000/{name}/freq"][:5]
+        del file[f"sol000/{name}/freq"]
+        file[f"sol000/{name}/freq"] = labels
+
+
+def only_data(file):
+    del file["sol000"]
+    file["sol000"] = np.zeros(3)
+
+
 def stokes(file):
     for name in ("amplitude000", "phase000"):
         file[f"sol000/{name}/pol"][:] = [b"I", b"V"]
@@ -306,10 +331,13 @@ FAULTS = {
     "antennas.fits": (without_names, "has gains of 4 antennas without names"),
     "names.fits": (other_names, "antenna 'Tile0' is none of the data, whose names are ant10, ant12, ant14"),
     "rows.fits": (short_table, "TILES has 5 rows, and SOLUTIONS 4"),
+    "overlap.fits": (overlapping, "Some time_ranges overlap"),
     "image.fits": (flat_image, "SOLUTIONS has shape .5, 64, 8., and not .times, tiles, channels, 8"),
     "clock.h5": (changed(as_clock), "it has clock000, and neither amplitude000 nor phase000"),
     "sets.h5": (changed(lambda file: file.copy("sol000", "sol001")), "the solution sets sol000, sol001; one is needed"),
     "axes.h5": (changed(other_axis), "amplitude000 and phase000 have different axes freq"),
+    "labels.h5": (changed(short_axis), "labels.h5"),
+    "data.h5": (changed(only_data), "not a readable H5Parm file"),
     "stokes.h5": (changed(stokes), "its polarizations are I, V; XX and YY are needed"),
     "text.h5": (lambda path, of_file, uvd: path.write_text("nothing"), "not a readable file of CalH5, calfits, H5Parm"),
 }
@@ -322,3 +350,105 @@ def test_faults_are_sentences(world, tmp_path, name):
     write(tmp_path / name, gains.conj(), data)
     with pytest.raises(InputError, match=sentence):
         by_file(tmp_path / name, data, sky)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("convention", ["divide", "multiply"])
+def test_what_is_written_is_what_is_read(world, tmp_path, name, convention):
+    """Also with gains that are flagged, and antennas that have none."""
+    data, _, gains = world
+    cal = make_uvcal(data, gains[:, :, :1])
+    cal.flag_array[2, 5] = True
+    if convention == "multiply":
+        cal.gain_array, cal.gain_convention = 1 / cal.gain_array, convention
+    cal.select(antenna_nums=cal.ant_array[1:])
+    write_gains(cal, tmp_path / name)
+    found = read_gains(tmp_path / name, "test", data)
+    expected = np.isnan(np.full(found.gain_array.shape, 0.0))
+    expected[0], expected[2, 5] = True, True
+    assert np.array_equal(found.flag_array, expected)
+    assert np.allclose(found.gain_array[~expected], gains[:, :, :1][~expected], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["gains.fits", "gains.h5"])
+def test_every_integration_is_written_and_read(world, tmp_path, name):
+    data, _, gains = world
+    each = gains.repeat(2, axis=2) * (1 + 0.1 * np.arange(N_TIMES)[:, None])
+    write_gains(make_uvcal(data, each), tmp_path / name)
+    found = read_gains(tmp_path / name, "test", data)
+    assert np.allclose(found.gain_array, each, rtol=1e-12)
+    centres = found.time_range.mean(axis=1)
+    assert np.abs(centres - np.unique(data.time_array)).max() * 86400 < 1e-3
+
+
+def test_files_of_jones_matrices_are_those_that_are_written_here(world, tmp_path):
+    """Byte for byte up to the times in the header, which calibrate leaves zero."""
+    data, _, gains = world
+    write_gains(make_uvcal(data, gains[:, :, :1]), tmp_path / "ours.bin")
+    write_bin(tmp_path / "theirs.bin", gains[:, :, :1].conj(), data)
+    ours, theirs = ((tmp_path / name).read_bytes() for name in ("ours.bin", "theirs.bin"))
+    assert ours[:32] == theirs[:32]
+    assert np.allclose(np.frombuffer(ours[48:], "<c16"), np.frombuffer(theirs[48:], "<c16"), rtol=1e-12)
+    start, end = struct.unpack("<2d", ours[32:48])
+    assert np.allclose([start, end], seconds(data)[0][[0, -1]], atol=1e-3)
+    write_gains(make_uvcal(data, gains[:, :, :1]), tmp_path / "ours.fits")
+    write_fits(tmp_path / "theirs.fits", gains[:, :, :1].conj(), data)
+    with fits.open(tmp_path / "ours.fits") as ours, fits.open(tmp_path / "theirs.fits") as theirs:
+        assert np.allclose(ours["SOLUTIONS"].data, theirs["SOLUTIONS"].data, rtol=1e-12)
+        for table, column in (("TILES", "TileName"), ("CHANBLOCKS", "Freq")):
+            assert np.array_equal(ours[table].data[column], theirs[table].data[column])
+
+
+def test_a_jones_matrix_needs_two_feeds(world, tmp_path):
+    data, _, gains = world
+    one = data.select(polarizations=[-5], inplace=False)
+    with pytest.raises(InputError, match=r"has gains of xx and yy, and these are of 1 feed"):
+        write_gains(make_uvcal(one, gains[:, :, :1, :1]), tmp_path / "gains.bin")
+    with pytest.raises(InputError, match=r"are not written as '.npy'; allowed are .h5, .fits, .bin"):
+        write_gains(make_uvcal(one, gains[:, :, :1, :1]), tmp_path / "gains.npy")
+
+
+def run_dp3(folder, *settings):
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "CASARCFILES": str(folder / "casarc")}
+    program = [ddecal._program(), "msin=data.ms", "numthreads=1", *settings]
+    subprocess.run(program, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE)
+
+
+@pytest.mark.skipif(ddecal._program() is None or find_spec("casacore") is None, reason="needs the extra [dp3]")
+@pytest.mark.filterwarnings("ignore:'where' used without 'out':UserWarning")
+def test_dp3_writes_what_is_read_and_applies_what_is_written(tmp_path):
+    """DP3's gains of a measurement set are the true ones; its applycal, with the true ones written here, leaves M."""
+    from casacore.tables import table
+
+    toy = make_toy(scattered(N_ANTENNAS), noise=0.0)
+    template = make_uvdata(toy, N_TIMES, (-5, -6, -7, -8))
+    template.telescope.name = ddecal.TELESCOPE
+    gains = 1 + 0.2 * complex_normal(np.random.default_rng(1), (N_ANTENNAS, template.Nfreqs, N_SOLUTIONS, 2))
+    values = np.zeros(to_cube(template).shape, complex)
+    values[..., :2] = toy.foregrounds[:, :, None]
+    model, data = from_cube(template, values), from_cube(template, values.copy())
+    to_cube(data)[..., :2] = corrupted(template, values[..., :2], gains)
+    for uvd in (data, model):
+        uvd.phase(lon=0.0, lat=-0.5, epoch="J2000", cat_name="field", phase_frame="icrs")
+    data.write_ms(str(tmp_path / "data.ms"), model_data=model.data_array)
+    ddecal._write_observatories(tmp_path)
+    settings = "type=ddecal mode=diagonal h5parm=gains.h5 modeldatacolumns=[MODEL_DATA] solint=2 nchan=1 uvlambdamin=0 "
+    settings += "maxiter=300 tolerance=1e-7 stepsize=0.5 detectstalling=false"
+    run_dp3(tmp_path, "msout=", "steps=[cal]", *(f"cal.{text}" for text in settings.split()))
+    found = read_gains(tmp_path / "gains.h5", "test", data)
+    assert not found.flag_array.any()
+    # The phase of all antennas together is free.
+    common = np.sum(gains * found.gain_array.conj(), axis=0)
+    # DP3 works in single precision, and stops at changes of 1e-7 when it converges slowly.
+    assert np.abs(found.gain_array * common / np.abs(common) - gains).max() < 3e-5
+    parallel = data.select(polarizations=[-5, -6], inplace=False)
+    write_gains(make_uvcal(parallel, gains.repeat(N_TIMES // N_SOLUTIONS, axis=2)), tmp_path / "true.h5")
+    apply = "type=applycal parmdb=true.h5 missingantennabehavior=unit"
+    steps = [f"{step}.{text}" for step in "ab" for text in apply.split()]
+    corrections = ["a.correction=amplitude000", "b.correction=phase000"]
+    run_dp3(tmp_path, "msout=out.ms", "steps=[a,b]", *steps, *corrections)
+    restored, expected = (
+        table(str(tmp_path / name), ack=False).getcol(column)
+        for name, column in (("out.ms", "DATA"), ("data.ms", "MODEL_DATA"))
+    )
+    assert np.abs(restored - expected).max() < 1e-5 * np.abs(expected).max()
