@@ -79,7 +79,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     structure = make_structure(data, settings)
     gains = assumed.gains
     if gains is None and settings.initial_gains.kind == "file":
-        gains = read_gains(settings.initial_gains.path, "calibration.initial_gains.path")
+        gains = read_gains(settings.initial_gains.path, "calibration.initial_gains.path", data.uvd)
     if gains is None and settings.initial_gains.kind == "redundant":
         start = redundant_start(data, weights, settings.initial_gains, settings.redundancy_tolerance)
     elif gains is None and settings.initial_gains.kind == "delays":

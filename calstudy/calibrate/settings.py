@@ -182,7 +182,7 @@ class UnityStart(Section):
 
 
 class FileStart(Section):
-    """Start from gains in a CalH5 or calfits file, at the integration closest in time."""
+    """Start from gains in a file, at the integration closest in time."""
 
     kind: Literal["file"]
     path: Path = Field(strict=False)

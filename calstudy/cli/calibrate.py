@@ -33,13 +33,14 @@ OPTIONS = (
     (r"--set outputs\.store=DIR", "--output"),
     (r"^output = ", "--output "),
     (r"^expected_loss: ", "--expected-loss: "),
+    (r"^also(\.\d+)?(:| =) ", "--also "),
     (r"`overwrite`", "--overwrite"),
 )
 """Fields of files in messages, and the options of the command that set them."""
 
 Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format that pyuvdata reads.", show_default=False)]
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
-Gains = Annotated[Path | None, typer.Option(help="CalH5 or calfits file to start from; by default unity.")]
+Gains = Annotated[Path | None, typer.Option(help="File of gains to start from; by default unity.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="YAML file: a `calibration` section.")]
 SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default) or adamax.")]
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
@@ -61,7 +62,12 @@ Set = Annotated[
     typer.Option("--set", metavar="FIELD=VALUE", help="Any field of `calibration`: --set basis.min_delay='50 ns'."),
 ]
 Output = Annotated[Path, typer.Option(help="Folder for the results.")]
-Calfits = Annotated[bool, typer.Option("--calfits", help="Also write the gains as calfits.")]
+Also = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FORMAT", help="Also write the gains as calfits, h5 (H5Parm), fits (hyperdrive) or bin (calibrate)."
+    ),
+]
 ExpectedLoss = Annotated[
     bool, typer.Option("--expected-loss", help="Also write the signal loss that the fit is expected to cause.")
 ]
@@ -86,7 +92,7 @@ def calibrate(
     interference: FlagInterference = False,
     overrides: Set = None,
     output: Output = Path("calibrated"),
-    calfits: Calfits = False,
+    also: Also = None,
     gain_errors: GainErrors = True,
     expected_loss: ExpectedLoss = False,
     overwrite: Overwrite = False,
@@ -122,7 +128,7 @@ def calibrate(
             "sky_model": None if sky_model is None else str(sky_model),
         },
         "calibration": _calibration(settings_file, changes),
-        "calfits": calfits,
+        "also": also or [],
         "gain_errors": gain_errors,
         "expected_loss": expected_loss,
     }
@@ -245,7 +251,7 @@ NAME = "gain-comparison"
 MOST_NAMES = 40
 """Largest number of antennas that are named on the axis."""
 
-First = Annotated[Path, typer.Argument(help="Gains, a CalH5 or calfits file.", show_default=False)]
+First = Annotated[Path, typer.Argument(help="Gains, a file of any format of gains.", show_default=False)]
 Second = Annotated[Path, typer.Argument(help="Gains that they are compared with, such as the true ones.")]
 OnlyRedundant = Annotated[
     bool,
@@ -265,15 +271,15 @@ def compare_gains(
     Antennas, feeds and channels that are in one file only are left out. One phase in every channel and one real
     scale are removed in every integration, because no data determine them.
     """
-    from calstudy.base.gains import at_common_channels, read_gains
+    from calstudy.base.gains import at_common_channels, read_gain_pair
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.plotting import style
     from calstudy.plotting.save import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():
-        files = read_gains(first, "the first file"), read_gains(second, "the second file")
-        found = compare_gains(pair_gains(*at_common_channels(*files), feed), redundant)
+        files = at_common_channels(*read_gain_pair(first, second))
+        found = compare_gains(pair_gains(*files, feed), redundant)
     numbers = _numbers(found)
     for name, value in numbers.items():
         typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")

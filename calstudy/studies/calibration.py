@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, SerializeAsAny, model_validator
 from rich.console import Console
@@ -42,7 +42,9 @@ from calstudy.studies.capacity import fit
 from calstudy.studies.folder import LOG, log_to, publish
 from calstudy.studies.study import RunProducts, Study, make
 
-CALFITS, FIGURE, UNFINISHED = "gains.calfits", "diagnostics", ".unfinished"
+FIGURE, UNFINISHED = "diagnostics", ".unfinished"
+GainFormat = Literal["calfits", "h5", "fits", "bin"]
+"""Suffix of gains in other formats than CalH5."""
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
@@ -148,7 +150,9 @@ class DataStudy(Study):
 class CalibrationFile(DataFile):
     """Measured data that are calibrated as a whole, and the results that are wanted; they go to `outputs.runs`."""
 
-    calfits: bool = Field(False, description="Also write the gains as calfits.")
+    also: Annotated[tuple[GainFormat, ...], Field(strict=False)] = Field(
+        (), description="Also write the gains as calfits, H5Parm (h5), or for hyperdrive (fits) or calibrate (bin)."
+    )
     gain_errors: bool = Field(True, description="Give gains their errors by noise.")
     expected_loss: bool = Field(False, description="Also write the signal loss that the fit is expected to cause.")
 
@@ -163,7 +167,12 @@ class DataCalibration(DataStudy):
         if content.expected_loss and not isinstance(content.calibration, GainFit):
             label = content.calibration.label
             raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
-        return cls(content, Parts({WHOLE: read_selected(content, content.observed.data, even=False)}))
+        facts = read_selected(content, content.observed.data, even=False)
+        if {"fits", "bin"} & set(content.also) and facts.frame.n_polarizations != 2:
+            raise InputError(
+                "also: fits and bin hold gains of xx and yy, and the data have only one; take calfits or h5"
+            )
+        return cls(content, Parts({WHOLE: facts}))
 
     @property
     def content(self) -> Any:
@@ -205,7 +214,7 @@ class DataCalibration(DataStudy):
 
         data, _, notes = observed(self.graph, WHOLE).read()
         if self.start is not None:
-            read_gains(self.start, "calibration.initial_gains.path")
+            read_gains(self.start, "calibration.initial_gains.path", data)
         return [*notes, *conspicuous(Observation(data))]
 
     @property
@@ -241,13 +250,23 @@ class DataCalibration(DataStudy):
             for name in (QUALITY, ERRORS):
                 (work / name).unlink(missing_ok=True)
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
-            if self.file.calfits:
-                from pyuvdata import UVCal
-
-                UVCal.from_file(work / GAINS).write_calfits(str(work / CALFITS))
+            self._write_gains_also(work)
             for path in work.iterdir():
                 path.replace(folder / path.name)
         return solution
+
+    def _write_gains_also(self, work: Path) -> None:
+        """Write the gains of a folder in other formats."""
+        from pyuvdata import UVCal
+
+        from calstudy.base.gain_formats import write_gains
+
+        for suffix in self.file.also:
+            gains, path = UVCal.from_file(work / GAINS), (work / GAINS).with_suffix(f".{suffix}")
+            if suffix == "calfits":
+                gains.write_calfits(str(path))
+            else:
+                write_gains(gains, path)
 
     def _solution(self, made: RunProducts, solved: Mapping[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         """Return the request, the changes of the data, what stands out, and every solve, as plain JSON types."""
@@ -285,7 +304,8 @@ def require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
     if output.exists() and not output.is_dir():
         raise InputError(f"output = {output}: is a file, not a folder")
-    names = (GAINS, CALFITS, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
+    gains = (str(Path(GAINS).with_suffix(f".{suffix}")) for suffix in get_args(GainFormat))
+    names = (GAINS, *gains, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
     present = [name for name in names if (output / name).exists()]
     present += [path.name for path in sorted(output.glob(f"{EXPECTED_TRANSFER}.*.h5"))]
     if present and not overwrite:

@@ -53,8 +53,9 @@ Written by calstudy {version}. The data are simulated: {antennas} antennas, {cha
 ## What to return
 
 For every data file a file of gains, in this folder or in a new one with a copy of `{manifest}`:
-{returned}. Allowed are CalH5 (`.calh5`), calfits (`.calfits`)
-and CASA tables (`.cal`, a folder).
+{returned}. Allowed are CalH5 (`.calh5`), calfits (`.calfits`),
+CASA tables (`.cal`, a folder), and what DP3 (H5Parm, `.h5`), hyperdrive (`.fits`) and calibrate of mwa-reduce (`.bin`)
+write when they calibrate UVFITS files or measurement sets.
 
 Besides, if you fitted one, a model of the foregrounds for every data file: {models}
 and so on (or `.model.uvfits`, `.model.ms`), visibilities in Jy before any gains, with the samples of the data, none of
@@ -67,7 +68,7 @@ other is not calibration.
 
 - V_measured = g_a conj(g_b) V_true for the baselines (a, b) of the files; noise is part of V_true. Gains are of the
   convention "divide" of pyuvdata: data are calibrated by dividing by g_a conj(g_b). Files that say "multiply" are
-  inverted.
+  inverted. Files of DP3, hyperdrive and calibrate are taken in the conventions of these programs.
 - Gains are complex numbers for every antenna, channel and feed; antennas are told by their numbers. They are for one
   time, which holds for all, or for every integration (times agree within half an integration).
 - Gains that are not known are flagged; samples with a flagged gain, and data that are flagged, have no part in the

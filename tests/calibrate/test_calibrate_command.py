@@ -17,6 +17,7 @@ from test_calamity import make_uvdata
 
 import calstudy
 from calstudy.base.errors import InputError
+from calstudy.base.gains import read_gains
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
 from calstudy.interface import CalibratedData
@@ -46,7 +47,8 @@ def data(toy, tmp_path):
 def finished(toy, tmp_path_factory):
     """The folder of data, with all that the command can write in its folder ``out``, and what it told."""
     folder, told = tmp_path_factory.mktemp("calibrated"), io.StringIO()
-    arguments = [write_data(toy, folder), *OPTIONS, "--output", "out", "--calfits", "--expected-loss"]
+    wanted = ["--also", "calfits", "--also", "h5", "--expected-loss"]
+    arguments = [write_data(toy, folder), *OPTIONS, "--output", "out", *wanted]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(told), redirect_stderr(told):
         patch.setattr(sys, "argv", ["calstudy", "calibrate", *map(str, arguments)])
         patch.chdir(folder)
@@ -112,9 +114,12 @@ def test_gains_without_errors_are_the_same(command, finished, tmp_path):
 
 def test_everything_is_written_and_readable(finished):
     out, data = finished[0] / "out", finished[0] / "data.uvh5"
-    assert {path.name for path in out.iterdir()} == {*WRITTEN, "gains.calfits", "expected-transfer.ee.h5"}
+    assert {path.name for path in out.iterdir()} == {*WRITTEN, "gains.calfits", "gains.h5", "expected-transfer.ee.h5"}
     gains, fits = UVCal.from_file(str(out / "gains.calh5")), UVCal.from_file(str(out / "gains.calfits"))
     assert np.allclose(gains.gain_array, fits.gain_array, rtol=1e-5)
+    parm = read_gains(out / "gains.h5", "test", UVData.from_file(str(data)))
+    assert np.array_equal(gains.flag_array, parm.flag_array)
+    assert np.allclose(*(np.where(gains.flag_array, 1, cal.gain_array) for cal in (gains, parm)), rtol=1e-9)
     model, residual = (UVData.from_file(str(out / name)) for name in ("model.uvh5", "residual.uvh5"))
     original = UVData.from_file(str(data))
     assert np.array_equal(residual.flag_array, original.flag_array)
@@ -201,8 +206,13 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
         (["data.uvh5", "--weights", "no.h5"], "--weights no.h5: neither gains, flags, nsamples or autos, nor a file"),
         (["data.uvh5", "--select", "antennas=3"], "--select antennas: '3' is not in the data"),
         (["data.uvh5", "--buffer", "2000 ns"], "fills all 64 channels"),
+        (["data.uvh5", "--also", "bin", *OPTIONS], "--also fits and bin hold gains of xx and yy"),
+        (["data.uvh5", "--also", "uvfits", *OPTIONS], "--also 'uvfits': not a choice"),
         (["data.uvh5", "--set", "autos=true"], "the data hold no autocorrelations"),
-        (["data.uvh5", "--gains", "data.uvh5", *OPTIONS], "not a readable CalH5 or calfits file"),
+        (
+            ["data.uvh5", "--gains", "data.uvh5", *OPTIONS],
+            "not a readable file of CalH5, calfits, H5Parm, hyperdrive or calibrate",
+        ),
     ],
 )
 def test_mistakes_are_one_sentence(command, data, arguments, sentence):

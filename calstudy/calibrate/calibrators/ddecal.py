@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from pydantic import Field
 
+from calstudy.base.gain_formats import read_h5parm
 from calstudy.base.observation import Frame
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.units import Frequency
@@ -84,7 +85,10 @@ class Ddecal(OtherPackage):
                 last = (ended.stdout.strip().splitlines() or ["it said nothing"])[-1]
                 outcome = Solve(status="failed", message=f"DP3 ended with exit code {ended.returncode}: {last}")
                 return np.full(shape, np.nan, complex), [outcome] * len(groups)
-            gains = _read_gains(folder / "gains.h5")[..., : len(groups)]
+            table = read_h5parm(folder / "gains.h5")
+        assert table.antennas is not None, "an H5Parm file has names"
+        order = np.argsort([int(name) for name in table.antennas])
+        gains = table.gains[order, :, : len(groups), 0]
         # A solution without data is one, NaN, or a copy of the previous solution.
         known = [_antennas_with_weight(measured, times) for times in groups]
         return np.where(np.stack(known, axis=2), gains, np.nan), self._outcomes(ended.stdout, len(groups))
@@ -239,17 +243,3 @@ def _write_observatories(folder: Path) -> None:
         observatories.putkeywords({**version, "VS_TYPE": "List of Observatories", "MJD0": 0.0, "dMJD": 0.0})
         observatories.putinfo({"type": "IERS", "subType": "", "readme": ""})
     (folder / "casarc").write_text(f"measures.directory: {folder / 'measures'}\n")
-
-
-def _read_gains(path: Path) -> np.ndarray:
-    """Read the gains of an H5Parm file, complex, (Nants, Nfreqs, Nsolutions), in the order of the antenna numbers.
-
-    Baselines of a measurement set are those of calstudy reversed, so that its gains are the complex conjugates.
-    """
-    import h5py
-
-    with h5py.File(path) as file:
-        solutions = file["sol000"]
-        amplitude, phase = (solutions[f"{name}000/val"][..., 0] for name in ("amplitude", "phase"))
-        numbers = [int(name) for name in solutions["amplitude000/ant"][()]]
-    return (amplitude * np.exp(-1j * phase)).transpose(2, 1, 0)[np.argsort(numbers)]

@@ -18,7 +18,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import FileName, require_inside
-from calstudy.base.gains import read_gains, require_solutions, solutions
+from calstudy.base.gain_tables import GainTable
+from calstudy.base.gains import read_gain_file, read_gains, require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import FOLDER, UNKEYED, Section, fault
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 
 SECONDS_PER_DAY = 86400.0
 MANIFEST = "manifest.json"
-GAINS_SUFFIXES = (".calh5", ".calfits", ".cal")
-"""CalH5, calfits, and a CASA table."""
+GAINS_SUFFIXES = (".calh5", ".calfits", ".cal", ".h5", ".fits", ".bin")
+"""CalH5, calfits, a CASA table, H5Parm, and files of hyperdrive and calibrate."""
 MODEL_SUFFIXES = (".model.uvh5", ".model.uvfits", ".model.ms")
 
 
@@ -75,9 +76,7 @@ class ByFile(Calibrator):
         description="Folder of gains with the manifest.json of the export, or of such folders for several worlds.",
         json_schema_extra=FOLDER,
     )
-    gains: Path | None = Field(
-        None, strict=False, description="In place of a folder, gains for all data: a CalH5 or calfits file."
-    )
+    gains: Path | None = Field(None, strict=False, description="In place of a folder, a file of gains for all data.")
     model: Path | None = Field(
         None, strict=False, description="Visibilities of the foregrounds, Jy, besides `gains`; null: the sky model."
     )
@@ -106,9 +105,12 @@ class ByFile(Calibrator):
             return None
         if self.model is None and not has_sky_model:
             return f"{self.gains.name} comes without a model of the foregrounds, and there is no sky model in its place"
-        cal = read_gains(self.gains, "by-file")
-        width = np.diff(frame.frequencies).min() if frame.n_channels > 1 else np.min(cal.channel_width)
+        cal = read_gain_file(self.gains, "by-file")
         try:
+            if isinstance(cal, GainTable):  # What else it needs is known with the data.
+                cal.require_channels(frame.n_channels)
+                return None
+            width = np.diff(frame.frequencies).min() if frame.n_channels > 1 else np.min(cal.channel_width)
             require_solutions(cal, frame.numbers, frame.frequencies, width)
         except InputError as error:
             return f"{self.gains.name}: {str(error).removeprefix('gains: ')}"
@@ -136,7 +138,7 @@ class ByFile(Calibrator):
 
 def _gains_at(path: Path, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
     """Return gains and flags, (Nants, Nfreqs, Ntimes, Npols); raises InputError if the file cannot be used."""
-    cal = read_gains(path, "by-file")
+    cal = read_gains(path, "by-file", observation.uvd)
     try:
         gains, flags = solutions(cal, observation.numbers, observation.frequencies, observation.polarizations)
     except InputError as error:

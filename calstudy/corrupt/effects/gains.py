@@ -173,13 +173,13 @@ def reflection_gain(
 
 
 class FileGains(GainEffect):
-    """Gains read from a CalH5 or calfits file with the same antennas and channels; flagged ones count as unity.
+    """Gains read from a file with the same antennas and channels; flagged ones count as unity.
 
     The file holds gains for one time, which are constant, or for as many as there are integrations, in their order.
     """
 
     kind: str = "file-gains"
-    path: Path = Field(strict=False, description="CalH5 or calfits file, relative to the experiment file or absolute.")
+    path: Path = Field(strict=False, description="File of gains, relative to the experiment file or absolute.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols).
@@ -189,7 +189,8 @@ class FileGains(GainEffect):
         """
         del random
         template = observation.uvd
-        values = gains_for(read_gains(self.path, "corruption.effects: path"), template)[antenna_rows(template)]
+        cal = read_gains(self.path, "corruption.effects: path", template)
+        values = gains_for(cal, template)[antenna_rows(template)]
         if values.shape[2] not in (1, observation.n_times):
             raise InputError(
                 f"corruption.effects: path = {str(self.path)!r}: holds gains for {values.shape[2]} times; it must hold "

@@ -1,0 +1,311 @@
+"""Gains in files of DP3 (H5Parm), hyperdrive (FITS) and calibrate of mwa-reduce (`.bin`).
+
+Such a file has antennas by name or only by order, no positions, and perhaps neither channels nor times: only with the
+data that it is for does it become a UVCal.
+
+All three describe visibilities as they are in measurement sets and UVFITS files, which are the complex conjugates of
+pyuvdata's. H5Parm holds gains, as here; hyperdrive and calibrate hold Jones matrices J that calibrate data, by
+J_a V_ab J_b^H. So g is the complex conjugate of the gain of an H5Parm file, and of 1 / J of the others.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.gain_tables import PARALLEL_HANDS, SECONDS_PER_DAY, GainTable
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import h5py
+    from pyuvdata import UVCal
+
+MJD_ZERO = 2400000.5
+"""Julian date of the modified Julian date zero."""
+FEEDS = {**PARALLEL_HANDS, "X": PARALLEL_HANDS["XX"], "Y": PARALLEL_HANDS["YY"]}
+"""Names in H5Parm files, as AIPS numbers."""
+LINEAR = np.array([FEEDS["XX"], FEEDS["YY"]])
+JONES_DIAGONAL = [0, 3]
+"""Places of XX and YY in a Jones matrix XX, XY, YX, YY."""
+MAGIC = b"MWAOCAL\0"
+HEADER = struct.Struct("<8s6I2d")
+"""Magic, type, structure, numbers of intervals, antennas, channels and polarizations, start and end."""
+H5PARM_AXES = ("ant", "freq", "time", "pol")
+
+Reader = Callable[["Path"], GainTable]
+
+
+def find_reader(path: Path) -> tuple[str, Reader] | None:
+    """Return the kind of a file, in words, and what reads it, or None if it is none of those here; may raise OSError.
+
+    The readers raise ValueError with a sentence if the file is not as its format demands.
+    """
+    import h5py
+
+    if path.is_dir():
+        return None
+    with path.open("rb") as file:
+        start = file.read(len(MAGIC))
+    if start == MAGIC or path.suffix == ".bin":
+        return "file of calibrate", read_mwaocal
+    if start.startswith(b"SIMPLE") and _has_solutions(path):
+        return "file of hyperdrive", read_hyperdrive
+    if h5py.is_hdf5(path):
+        with h5py.File(path) as opened:
+            if _solution_sets(opened):
+                return "H5Parm file", read_h5parm
+    return None
+
+
+def read_mwaocal(path: Path) -> GainTable:
+    """Read the binary file of calibrate, which hyperdrive also writes; its times, often zero, are ignored."""
+    content = path.read_bytes()
+    if len(content) < HEADER.size or not content.startswith(MAGIC):
+        raise ValueError("it does not start with MWAOCAL")
+    _, kind, structure, *shape, _, _ = HEADER.unpack_from(content)
+    if kind or structure or shape[-1] != len(LINEAR) ** 2:
+        raise ValueError(f"its type, structure and polarizations are {kind}, {structure}, {shape[-1]}, and not 0, 0, 4")
+    expected = HEADER.size + 16 * int(np.prod(shape, dtype=object))
+    if len(content) != expected or 0 in shape:
+        sizes = f"{shape[0]} intervals, {shape[1]} antennas and {shape[2]} channels"
+        raise ValueError(f"it has {len(content)} bytes, and its header promises {expected}, of {sizes}")
+    jones = np.frombuffer(content, "<c16", offset=HEADER.size).reshape(shape)
+    return GainTable(_of_jones(jones), feeds=LINEAR)
+
+
+def read_hyperdrive(path: Path) -> GainTable:
+    """Read a FITS file of hyperdrive; only the solutions themselves must be there."""
+    from astropy.io import fits
+
+    with fits.open(path) as hdus:
+        values = np.asarray(hdus["SOLUTIONS"].data, float)
+        if values.ndim != 4 or values.shape[-1] != 8:
+            raise ValueError(f"SOLUTIONS has shape {values.shape}, and not (times, tiles, channels, 8)")
+        n_times, n_tiles, n_channels, _ = values.shape
+        names = _column(hdus, "TILES", "TileName", n_tiles)
+        frequencies = _column(hdus, "CHANBLOCKS", "Freq", n_channels)
+        start, end = (_column(hdus, "TIMEBLOCKS", name, n_times) for name in ("Start", "End"))
+    # Columns that hyperdrive does not know are zero or NaN.
+    if frequencies is not None and not (np.isfinite(frequencies).all() and (frequencies > 0).all()):
+        frequencies = None
+    times = None
+    if start is not None and end is not None and start.all() and end.all():
+        times = _julian_dates(np.stack([start, end], axis=1))
+    return GainTable(
+        _of_jones(values[..., ::2] + 1j * values[..., 1::2]),
+        None if names is None else [str(name).strip() for name in names],
+        frequencies,
+        times,
+        LINEAR,
+        widened=0.25,  # They are the centres of the first and the last integration.
+    )
+
+
+def read_h5parm(path: Path) -> GainTable:
+    """Read amplitudes and phases of an H5Parm file; either may be missing, and every axis but that of antennas."""
+    import h5py
+
+    with h5py.File(path) as file:
+        sets = _solution_sets(file)
+        if len(sets) != 1:
+            raise ValueError(f"it has the solution sets {', '.join(sets)}; one is needed")
+        group = file[sets[0]]
+        names = [name for name in ("amplitude000", "phase000") if name in group]
+        if not names:
+            raise ValueError(f"it has {', '.join(group)}, and neither amplitude000 nor phase000")
+        tables = {name: _soltab(group[name]) for name in names}
+    axes: dict[str, np.ndarray] = {}
+    for name, (_, found) in tables.items():
+        for axis, labels in found.items():
+            if axis not in axes or len(axes[axis]) == 1:
+                axes[axis] = labels
+            elif len(labels) > 1 and not np.array_equal(axes[axis], labels):
+                raise ValueError(f"amplitude000 and {name} have different axes {axis}")
+    amplitude, phase = (tables[name][0] if name in tables else None for name in ("amplitude000", "phase000"))
+    gains: Any = (1.0 if amplitude is None else amplitude) * (1.0 if phase is None else np.exp(-1j * phase))
+    feeds = None
+    if "pol" in axes:
+        kept = [place for place, name in enumerate(axes["pol"]) if name in FEEDS]
+        if not kept:
+            raise ValueError(f"its polarizations are {', '.join(axes['pol'])}; XX and YY are needed")
+        feeds, gains = np.array([FEEDS[axes["pol"][place]] for place in kept]), gains[..., kept]
+    return GainTable(
+        np.asarray(gains, complex), list(axes["ant"]), axes.get("freq"), _intervals(axes.get("time")), feeds, -0.25
+    )
+
+
+def _intervals(seconds: np.ndarray | None) -> np.ndarray | None:
+    """Return the start and end of solutions, Julian dates, (Ntimes, 2), for their centres, in s as modified dates.
+
+    The file does not say how long they are: they are taken to follow each other.
+    """
+    if seconds is None or len(seconds) == 1:
+        return None
+    half = np.min(np.diff(seconds)) / 2
+    return (seconds[:, None] + half * np.array([-1, 1])) / SECONDS_PER_DAY + MJD_ZERO
+
+
+def _soltab(group: h5py.Group) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the values of a solution table, (ant, freq, time, pol), missing axes of length one, and its axes.
+
+    Values are NaN where their weight is zero.
+    """
+    names = _text(group["val"].attrs["AXES"]).split(",")
+    values = group["val"][()]
+    if "weight" in group:
+        values = np.where(group["weight"][()] > 0, values, np.nan)
+    for axis in set(names) - set(H5PARM_AXES):
+        place = names.index(axis)
+        if values.shape[place] != 1:
+            raise ValueError(f"it has {values.shape[place]} solutions along {axis!r}, and one is needed")
+        values = values.take(0, place)
+        names.remove(axis)
+    if "ant" not in names:
+        raise ValueError("it has no axis of antennas")
+    axes = {axis: group[axis][()] for axis in names}
+    for axis in {"ant", "pol"} & set(names):
+        axes[axis] = np.array([_text(label) for label in axes[axis]])
+    values = values.transpose([names.index(axis) for axis in H5PARM_AXES if axis in names])
+    return np.expand_dims(values, [i for i, axis in enumerate(H5PARM_AXES) if axis not in names]), axes
+
+
+def _text(value: bytes | str) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def _solution_sets(file: h5py.File) -> list[str]:
+    """Return the names of the solution sets of an H5Parm file; other files have none."""
+    return [name for name in file if "h5parm_version" in file[name].attrs or name.startswith("sol")]
+
+
+def _has_solutions(path: Path) -> bool:
+    from astropy.io import fits
+
+    with fits.open(path) as hdus:
+        return "SOLUTIONS" in hdus
+
+
+def _column(hdus: Any, table: str, name: str, count: int) -> np.ndarray | None:
+    """Return a column of a FITS table, or None if there is none; raises ValueError if it has another length."""
+    if table not in hdus or name not in hdus[table].columns.names:
+        return None
+    column = np.asarray(hdus[table].data[name])
+    if len(column) != count:
+        raise ValueError(f"{table} has {len(column)} rows, and SOLUTIONS {count}")
+    return column
+
+
+def _of_jones(jones: np.ndarray) -> np.ndarray:
+    """Return gains, (Nants, Nfreqs, Ntimes, 2), of Jones matrices that calibrate, (Ntimes, Nants, Nfreqs, 4)."""
+    diagonal = jones[..., JONES_DIAGONAL]
+    known = np.isfinite(jones).all(axis=-1, keepdims=True) & (diagonal != 0)
+    return np.moveaxis(np.where(known, 1 / np.where(known, diagonal, 1).conj(), np.nan), 0, 2)
+
+
+def _julian_dates(gps: np.ndarray) -> np.ndarray:
+    """Return the Julian dates (UTC) of GPS seconds."""
+    from astropy.time import Time
+
+    return Time(gps, format="gps").utc.jd
+
+
+def write_gains(cal: UVCal, path: Path) -> None:
+    """Write gains by channel in the format of a suffix in `WRITERS`, for UVFITS files and measurement sets.
+
+    All antennas of the telescope are written, by ascending number. Raises InputError for another suffix, and if a
+    format of Jones matrices lacks a feed.
+    """
+    if path.suffix not in WRITERS:
+        raise InputError(f"{path}: gains are not written as {path.suffix!r}; allowed are {', '.join(WRITERS)}")
+    WRITERS[path.suffix](GainTable.of(cal), path)
+
+
+def _write_mwaocal(table: GainTable, path: Path) -> None:
+    jones, gps = _to_jones(table, path), _gps(table)
+    header = HEADER.pack(MAGIC, 0, 0, *jones.shape, gps[0, 0], gps[-1, 1])
+    path.write_bytes(header + jones.astype("<c16").tobytes())
+
+
+def _write_hyperdrive(table: GainTable, path: Path) -> None:
+    from astropy.io import fits
+    from astropy.table import Table
+
+    jones, gps = _to_jones(table, path), _gps(table)
+    tables = {
+        "TIMEBLOCKS": {"Start": gps[:, 0], "End": gps[:, 1], "Average": gps.mean(axis=1)},
+        "TILES": {
+            "Antenna": np.arange(jones.shape[1], dtype=np.int32),
+            "Flag": np.isnan(jones).all(axis=(0, 2, 3)).astype(np.int32),
+            "TileName": np.array(table.antennas),
+        },
+        "CHANBLOCKS": {
+            "Index": np.arange(jones.shape[2], dtype=np.int32),
+            "Flag": np.isnan(jones).all(axis=(0, 1, 3)).astype(np.int32),
+            "Freq": table.frequencies,
+        },
+    }
+    primary = fits.PrimaryHDU()
+    primary.header["SOFTWARE"] = "calstudy"
+    hdus = [primary, fits.ImageHDU(jones.view(float), name="SOLUTIONS")]
+    hdus += [fits.BinTableHDU(Table(columns), name=name) for name, columns in tables.items()]
+    fits.HDUList(hdus).writeto(path, overwrite=True)
+
+
+def _write_h5parm(table: GainTable, path: Path) -> None:
+    import h5py
+
+    assert table.times is not None, "`of` knows them"
+    assert table.feeds is not None, "`of` knows them"
+    hands = {number: name for name, number in PARALLEL_HANDS.items()}
+    gains = table.gains.conj().transpose(2, 1, 0, 3)
+    axes = {
+        "time": (table.times.mean(axis=1) - MJD_ZERO) * SECONDS_PER_DAY,
+        "freq": table.frequencies,
+        "ant": _terminated(table.antennas or []),
+        "pol": _terminated([hands[int(feed)] for feed in table.feeds]),
+    }
+    with h5py.File(path, "w") as file:
+        group = file.create_group("sol000")
+        group.attrs["h5parm_version"] = np.bytes_(b"1.0")
+        for name, values in (("amplitude", np.abs(gains)), ("phase", np.angle(gains))):
+            soltab = group.create_group(f"{name}000")
+            soltab.attrs["TITLE"] = np.bytes_(name.encode())
+            soltab.attrs["h5parm_version"] = np.bytes_(b"1.0")
+            for axis, labels in axes.items():
+                soltab[axis] = labels
+            for data, array in (("val", values), ("weight", np.isfinite(values).astype(np.float32))):
+                soltab[data] = array
+                soltab[data].attrs["AXES"] = np.bytes_(",".join(axes).encode())
+
+
+def _terminated(texts: list[str]) -> np.ndarray:
+    """Return texts that end with a zero byte: DP3 does not find antennas of other names."""
+    return np.array(texts, f"S{max(len(text) for text in texts) + 1}")
+
+
+WRITERS = {".h5": _write_h5parm, ".fits": _write_hyperdrive, ".bin": _write_mwaocal}
+
+
+def _to_jones(table: GainTable, path: Path) -> np.ndarray:
+    """Return Jones matrices that calibrate, complex, (Ntimes, Nants, Nfreqs, 4); raises InputError if a feed lacks."""
+    feeds = [] if table.feeds is None else table.feeds.tolist()
+    if sorted(feeds) != sorted(LINEAR):
+        raise InputError(f"{path}: a Jones matrix has gains of xx and yy, and these are of {len(feeds)} feed(s)")
+    gains = np.moveaxis(table.gains[..., [feeds.index(feed) for feed in LINEAR]], 2, 0)
+    jones = np.zeros((*gains.shape[:3], 4), complex)
+    known = np.isfinite(gains).all(axis=-1)
+    jones[..., JONES_DIAGONAL] = 1 / np.where(known[..., None], gains, 1).conj()
+    jones[~known] = complex(np.nan, np.nan)
+    return jones
+
+
+def _gps(table: GainTable) -> np.ndarray:
+    """Return the start and end of each solution in s of GPS, (Ntimes, 2)."""
+    from astropy.time import Time
+
+    return Time(table.times, format="jd", scale="utc").gps
