@@ -127,17 +127,25 @@ def write_gain_errors(path: Path, amplitude: np.ndarray, phase: np.ndarray) -> N
             group.create_dataset(name, data=values.astype(np.float32), compression="gzip")
 
 
-def read_gain_errors(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read what `write_gain_errors` added, (Nants, Nfreqs, Ntimes, Npols); raises InputError if there is none."""
+def find_gain_errors(path: Path) -> np.ndarray | None:
+    """Read what `write_gain_errors` added, (2, Nants, Nfreqs, Ntimes, Npols), or return None if there is none."""
     import h5py
 
     with h5py.File(path) as file:
         if ERRORS_GROUP not in file:
-            raise InputError(
-                f"{path}: has no errors of gains, because none are known for its calibration, or it is of a version "
-                "that wrote none"
-            )
-        return tuple(file[ERRORS_GROUP][name][()] for name in ("amplitude", "phase"))
+            return None
+        return np.stack([file[ERRORS_GROUP][name][()] for name in ("amplitude", "phase")])
+
+
+def read_gain_errors(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the errors of |g| and of the phase, (Nants, Nfreqs, Ntimes, Npols); raises InputError if there are none."""
+    found = find_gain_errors(path)
+    if found is None:
+        raise InputError(
+            f"{path}: has no errors of gains, because none are known for its calibration, or it is of a version that "
+            "wrote none"
+        )
+    return found[0], found[1]
 
 
 def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

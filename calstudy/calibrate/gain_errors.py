@@ -29,16 +29,20 @@ plus exact degeneracies. Smooth gains count as determined there: far from where 
 The errors are those of noise of which the weights are the inverse variance, up to a factor, and to first order. What
 does not change from one noise realization to the next has no part in them: errors of a sky model that has no prior, and
 foregrounds outside their basis. They are part of the residual, and there they count as noise, as the signal does.
+
+What foregrounds absorb takes most of the time. It changes variances by a factor over those of known foregrounds, which
+hardly changes while the sky turns by less than a fringe, and which `ErrorsInTime` keeps for that time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.gain_variances import Alignment, as_a_whole, by_antenna, by_channel, pair
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
@@ -48,7 +52,24 @@ ORDERS = 3
 """Powers of a smooth change of the gains that are larger than the noise."""
 MOST_UNKNOWNS = 2048
 """Largest number of real unknowns, besides smooth ones, whose matrix is inverted as a whole."""
+TURNS_PER_DAY = 1.00274
+"""Of the sky."""
+SIMILAR_DEVIATION = 0.05
+"""Relative change of an estimated deviation of the foregrounds that changes errors by less."""
 NoiseFrom = Literal["weights", "residual"]
+
+
+class Absorption(NamedTuple):
+    """What foregrounds absorb.
+
+    Attributes
+    ----------
+    variances : variances of gains over those with known foregrounds, (2, Nants, Nfreqs); of amplitudes, then phases
+    sequences : number of complex numbers in the data
+    """
+
+    variances: np.ndarray
+    sequences: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +87,7 @@ class GainErrors:
     smooth_fraction : fraction of the numbers in the gains that are ``smooth``
     unevenness : mean over median of the residual's power in channels: about one for noise, more for interference
     determined : function that takes these directions out of a relative change of the gains, complex, (Nants, Nfreqs)
+    absorbed : what foregrounds absorb
     """
 
     amplitude: np.ndarray = field(metadata={"unit": ""})
@@ -77,6 +99,7 @@ class GainErrors:
     smooth_fraction: float
     unevenness: float
     determined: Callable[[np.ndarray], np.ndarray]
+    absorbed: Absorption
 
     def summary(self, gains: np.ndarray) -> dict[str, Any]:
         """Return the median errors and signal to noise, and what they mean, as plain JSON types."""
@@ -95,7 +118,11 @@ class GainErrors:
 
 
 def gain_errors(
-    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, frequencies: np.ndarray
+    problem: CalibrationProblem,
+    gains: np.ndarray,
+    model: np.ndarray,
+    frequencies: np.ndarray,
+    absorbed: Absorption | None = None,
 ) -> GainErrors | str:
     """Compute the errors of gains by noise, or say in a sentence why there are none.
 
@@ -104,14 +131,15 @@ def gain_errors(
     problem : the fitted problem, with the weights of its last pass
     gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
     frequencies : channel centres, Hz, (Nfreqs,)
+    absorbed : what foregrounds absorb, as of a similar problem; by default it is computed
     """
     structure = problem.structure
     if structure.gain_vectors is not None:
         return "the gains are restricted to smooth functions, whose errors are not known"
     tangent, has_data = TangentSpace.at(problem, gains, model), problem.antenna_weights > 0
     alignment = Alignment.at(problem, gains, has_data)
-    degrees = 2 * (np.count_nonzero(problem.weights) - np.count_nonzero(has_data)) + alignment.n_aligned
-    degrees -= sum(2 * response.sequences.shape[2] for response in tangent.responses)
+    sequences = absorbed.sequences if absorbed is not None else tangent.n_sequences
+    degrees = 2 * (np.count_nonzero(problem.weights) - np.count_nonzero(has_data) - sequences) + alignment.n_aligned
     if not tangent.finite and degrees < 1:
         return "the fit has as many unknowns as data, and leaves no residual that tells the noise"
     free = not problem.frozen and not tangent.finite
@@ -120,9 +148,10 @@ def gain_errors(
     if not any(span.size for span in spans):
         return f"foregrounds can follow gains up to delays of {delay * 1e9:.0f} ns, and the channels resolve no others"
     unknowns = 2 * sum(span.shape[1] for span in spans)
-    if problem.frozen:
-        variances = by_channel(tangent, structure.antennas, alignment)
-    else:
+    variances = known = by_channel(tangent, structure.antennas, alignment)
+    if absorbed is not None:
+        variances = known * absorbed.variances
+    elif not problem.frozen:
         invert = as_a_whole if unknowns <= MOST_UNKNOWNS else by_antenna
         variances = invert(tangent, structure.antennas, alignment, spans)
     residual = problem.visibilities - gain_products(gains, structure.antennas) * model
@@ -145,7 +174,44 @@ def gain_errors(
         1 - unknowns / (2 * np.count_nonzero(has_data)),
         float(np.mean(powers) / np.median(powers)) if loss > 0 else 1.0,
         determined,
+        Absorption(np.divide(variances, known, out=np.zeros(known.shape), where=known > 0), sequences),
     )
+
+
+class ErrorsInTime:
+    """Errors of solves of one polarization, in the order of time; see `gain_errors`.
+
+    Parameters
+    ----------
+    frequencies : channel centres, Hz, (Nfreqs,)
+    longest : longest baseline, m
+    """
+
+    def __init__(self, frequencies: np.ndarray, longest: float) -> None:
+        self._frequencies = frequencies
+        self._fringe = SPEED_OF_LIGHT / (frequencies.max() * longest) / (2 * np.pi * TURNS_PER_DAY)
+        self._last: tuple[CalibrationProblem, float, Absorption] | None = None
+
+    def of(self, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, time: float) -> GainErrors | str:
+        """Return the errors of a solve at a time, a Julian date in days."""
+        absorbed = self._known(problem, time)
+        found = gain_errors(problem, gains, model, self._frequencies, absorbed)
+        if absorbed is None and isinstance(found, GainErrors):
+            self._last = problem, time, found.absorbed
+        return found
+
+    def _known(self, problem: CalibrationProblem, time: float) -> Absorption | None:
+        """Return what foregrounds absorb, if it was computed for the same samples and prior, within a fringe."""
+        if self._last is None:
+            return None
+        last, then, absorbed = self._last
+        alike = (
+            0 <= time - then < self._fringe
+            and problem.structure == last.structure
+            and np.array_equal(problem.weights > 0, last.weights > 0)
+            and np.allclose(problem.deviations, last.deviations, rtol=SIMILAR_DEVIATION)
+        )
+        return absorbed if alike else None
 
 
 def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:

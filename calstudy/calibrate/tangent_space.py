@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -49,31 +50,46 @@ class TangentSpace:
 
     Attributes
     ----------
+    problem : the fitted problem
     roots : square root of D, (Nbls, Nfreqs)
     slope : sqrt(D) F, the derivative of a baseline in a relative change of a gain, (Nbls, Nfreqs), complex
-    conjugated : baselines that have the conjugate of their model, (Nbls,) bool
-    responses : responses of the foregrounds, one for each model
-    finite : whether the foregrounds have a finite prior
     """
 
+    problem: CalibrationProblem
     roots: np.ndarray
     slope: np.ndarray
-    conjugated: np.ndarray
-    responses: tuple[Response, ...]
-    finite: bool
 
     @classmethod
     def at(cls, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray) -> TangentSpace:
         """Return the tangent space at a solution, gains (Nants, Nfreqs) and model (Nbls, Nfreqs)."""
-        structure = problem.structure
-        curvature = problem.weights * np.abs(gain_products(gains, structure.antennas)) ** 2
+        curvature = problem.weights * np.abs(gain_products(gains, problem.structure.antennas)) ** 2
         roots = np.sqrt(curvature)
-        responses = []
-        for bucket in () if problem.frozen else structure.basis.buckets:
+        return cls(problem, roots, roots * model)
+
+    @property
+    def conjugated(self) -> np.ndarray:
+        """Baselines that have the conjugate of their model, bool, (Nbls,)."""
+        return self.problem.structure.conjugated
+
+    @property
+    def finite(self) -> bool:
+        """Whether the foregrounds have a finite prior."""
+        return self.problem.structure.prior != "none"
+
+    @cached_property
+    def responses(self) -> tuple[Response, ...]:
+        """Responses of the foregrounds, one for each model."""
+        problem, found = self.problem, []
+        for bucket in () if problem.frozen else problem.structure.basis.buckets:
             for index in bucket.members:
-                members = np.flatnonzero(structure.groups == index)
-                responses.append(_response(problem, members, roots[members], bucket.vectors))
-        return cls(roots, roots * model, structure.conjugated, tuple(responses), structure.prior != "none")
+                members = np.flatnonzero(problem.structure.groups == index)
+                found.append(_response(problem, members, self.roots[members], bucket.vectors))
+        return tuple(found)
+
+    @property
+    def n_sequences(self) -> int:
+        """Number of sequences of all foregrounds."""
+        return sum(response.sequences.shape[2] for response in self.responses)
 
     def without_foregrounds(self, values: np.ndarray) -> np.ndarray:
         """Return W y of whitened changes y, (1 - P_F) y if foregrounds are free; complex, (Nbls, Nfreqs, ...)."""

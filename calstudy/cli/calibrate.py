@@ -66,7 +66,7 @@ ExpectedLoss = Annotated[
     bool, typer.Option("--expected-loss", help="Also write the signal loss that the fit is expected to cause.")
 ]
 GainErrors = Annotated[
-    bool, typer.Option(help="Give gains their errors by noise; of large arrays they take longer than the solves.")
+    bool, typer.Option(help="Give gains their errors by noise; about a third of the time of the solves.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Read and check everything, say what would be done, and stop.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of an earlier calibration.")]

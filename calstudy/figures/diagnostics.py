@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from pydantic import Field
 
+from calstudy.base.gains import find_gain_errors
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 from calstudy.products.calibration import read_result
-from calstudy.products.files import DATA, read_visibilities
+from calstudy.products.files import DATA, GAINS, read_visibilities
+from calstudy.products.gain_errors import observed_gain_errors
 from calstudy.products.observed import calibrated, observed
 from calstudy.run.task import Job, Task
 
@@ -45,6 +48,7 @@ class Diagnostics:
     frequency : Hz, (Nfreqs,)
     antennas : names of the antennas that are drawn, (Nshown,)
     gains : complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs)
+    errors : of |g| and, in rad, of the phase, by noise; NaN where they are not known, (2, Nshown, Nfreqs)
     losses : loss after each step over the first loss of its own solve, one array for each solve
     converged : true for each solve that converged, (Nsolves,)
     chi2_antennas : names of all calibrated antennas, (Nants,)
@@ -61,6 +65,7 @@ class Diagnostics:
     frequency: np.ndarray
     antennas: np.ndarray
     gains: np.ndarray
+    errors: np.ndarray
     losses: tuple[np.ndarray, ...]
     converged: np.ndarray
     chi2_antennas: np.ndarray
@@ -91,18 +96,23 @@ def draw_diagnostics(found: Diagnostics) -> Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
     The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
-    samples count as zero, which spreads over all delays.
+    samples count as zero, which spreads over all delays. Bands are the errors of gains by noise.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 8.4)
     grid = figure.subplot_mosaic([list("dddmmmrrr"), list("pppppllll"), list("aaaaaffff"), list("xxxyyyzzz")])
     _draw_images(figure, [grid[key] for key in "dmr"], found)
     _draw_profile(grid["p"], found)
     _draw_convergence(grid["l"], found)
-    for key, values, label in (("a", np.abs(found.gains), r"$|g|$"), ("f", np.angle(found.gains), r"arg $g$ (rad)")):
-        for name, row in zip(found.antennas, values, strict=True):
-            grid[key].plot(found.frequency / 1e6, row, linewidth=0.7, label=str(name))
-        grid[key].set(xlabel=style.FREQUENCY, ylabel=label)
-        grid[key].margins(x=0)
+    for axes, values, errors, label in (
+        (grid["a"], np.abs(found.gains), found.errors[0], r"$|g|$"),
+        (grid["f"], np.angle(found.gains), found.errors[1], r"arg $g$ (rad)"),
+    ):
+        for name, row, error in zip(found.antennas, values, errors, strict=True):
+            (line,) = axes.plot(found.frequency / 1e6, row, linewidth=0.7, label=str(name))
+            band = row - error, row + error
+            axes.fill_between(found.frequency / 1e6, *band, color=line.get_color(), alpha=0.25, linewidth=0)
+        axes.set(xlabel=style.FREQUENCY, ylabel=label)
+        axes.margins(x=0)
     _make_logarithmic(grid["a"], np.abs(found.gains))
     _draw_chi2([grid[key] for key in "xyz"], found)
     for axes in grid.values():
@@ -211,10 +221,13 @@ def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> Diagnostics:
+def diagnose(
+    data: UVData, result: CalibrationResult, errors: np.ndarray | None = None, polarization: int = 0
+) -> Diagnostics:
     """Collect the arrays of the diagnostic figure for one polarization, given by its index.
 
-    `data` are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its result.
+    `data` are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its result. `errors` are of |g|
+    and of the phase of its gains, (2, Nants, Nfreqs, Ntimes, Npols).
     """
     from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, rows_of, to_cube
     from calstudy.calibrate.basis import channel_grid
@@ -231,7 +244,7 @@ def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> 
         delay_rms(np.where(flags, 0, cube)[:, order], grid.positions, grid.n_channels)
         for cube in (measured, to_cube(model)[..., polarization], to_cube(result.residual)[..., polarization])
     ]
-    antennas, gains = _shown_gains(result, polarization)
+    antennas, gains, shown_errors = _shown_gains(result, errors, polarization)
     number = int(model.polarization_array[polarization])
     records = [record for record in result.solutions if record.polarization == number]
     quality = assess(data, result, polarization)
@@ -246,6 +259,7 @@ def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> 
         frequency=np.asarray(model.freq_array, float),
         antennas=antennas,
         gains=gains,
+        errors=shown_errors,
         losses=tuple(record.loss_history / record.loss_history[0] for record in records if record.loss_history.size),
         chi2_antennas=quality.antennas,
         chi2_by_antenna=quality.chi2_by_antenna,
@@ -255,8 +269,10 @@ def diagnose(data: UVData, result: CalibrationResult, polarization: int = 0) -> 
     )
 
 
-def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return names of antennas with solutions, spread over the array, and their gains, NaN where flagged."""
+def _shown_gains(
+    result: CalibrationResult, errors: np.ndarray | None, polarization: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return names of antennas with solutions, spread over the array, their gains, NaN where flagged, and errors."""
     gains = result.gains
     flags = gains.flag_array[..., polarization]
     used = np.flatnonzero(~flags.all(axis=(1, 2)))
@@ -267,27 +283,34 @@ def _shown_gains(result: CalibrationResult, polarization: int) -> tuple[np.ndarr
     times = np.flatnonzero(~flags.all(axis=(0, 1)))
     middle = times[times.size // 2] if times.size else 0
     names = dict(zip(gains.telescope.antenna_numbers.tolist(), gains.telescope.antenna_names, strict=True))
-    return np.array([str(names[int(number)]) for number in gains.ant_array[used]]), values[:, :, middle]
+    found = np.full((2, *values.shape[:2]), np.nan) if errors is None else errors[:, used][..., middle, polarization]
+    return np.array([str(names[int(number)]) for number in gains.ant_array[used]]), values[:, :, middle], found
 
 
 class DiagnosticsFigure(StudyFigure):
     """Diagnostics of a calibration of measured data, of the even half or of all data."""
 
+    # Gains are drawn with their errors since 2.
+    version: ClassVar[int] = 2
     kind: str = "diagnostics"
+
+    gain_errors: bool = Field(True, description="Draw the errors of gains, and compute them if they are not yet.")
 
     of = ("observed",)
     caption = (
         "The calibration of the measured data, of the first polarization: data, model and residual by baseline length "
-        "and delay, convergence of the solves, gains, and chi^2 of antennas, channels and integrations."
+        "and delay, convergence of the solves, gains with errors, and chi^2 of antennas, channels and integrations."
     )
 
     def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
         """Return the data and the calibration of the first part."""
         part = next(iter(graph.parts.facts))
-        return {"data": observed(graph, part), "calibration": calibrated(graph, part)}
+        errors = {"errors": observed_gain_errors(graph, part)} if self.gain_errors else {}
+        return {"data": observed(graph, part), "calibration": calibrated(graph, part), **errors}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the diagnostics of the first polarization."""
         data = read_visibilities(job.inputs["data"] / DATA)
-        found = diagnose(data, read_result(job.inputs["calibration"]))
+        errors = find_gain_errors(job.inputs["errors"] / GAINS) if self.gain_errors else None
+        found = diagnose(data, read_result(job.inputs["calibration"]), errors)
         return Drawing(draw_diagnostics(found), found)

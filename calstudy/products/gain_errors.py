@@ -90,7 +90,7 @@ class OfSolves(Calibrated):
         import numpy as np
 
         from calstudy.base.visibilities import to_cube
-        from calstudy.calibrate.gain_errors import gain_errors as errors_of
+        from calstudy.calibrate.gain_errors import ErrorsInTime
         from calstudy.calibrate.preparation import problem_at
 
         settings = self.calibrator
@@ -104,6 +104,8 @@ class OfSolves(Calibrated):
         settings = settings.model_copy(update={"initial_gains": UnityStart()})
         prepared, cube = prepared_fit(settings, *self.read()), to_cube(result.model)
         rows = positions(result.gains.ant_array, prepared.data.numbers)
+        data = prepared.data
+        errors = [ErrorsInTime(data.frequencies, data.lengths.max()) for _ in range(data.n_polarizations)]
         for solve in result.solutions:
             times = slice(solve.integration, solve.integration + solve.n_integrations)
             place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
@@ -119,7 +121,7 @@ class OfSolves(Calibrated):
                 found = RAN_AWAY
             else:
                 model = cube[times, :, :, place].reshape(problem.visibilities.shape)
-                found = errors_of(problem, gains, model, prepared.data.frequencies)
+                found = errors[place].of(problem, gains, model, data.times[times.start])
             yield SolvedGains(rows, times, place, gains, found)
 
     def _cost(self) -> Cost:
@@ -132,7 +134,7 @@ class OfSolves(Calibrated):
         return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
-class ErrorsOfGains(OfSolves, stage="gain-errors", version=2):
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=3):
     """The gains of a calibration with their errors."""
 
     def make(self, output: Path) -> Mapping[str, Any]:

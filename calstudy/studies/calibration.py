@@ -149,7 +149,7 @@ class CalibrationFile(DataFile):
     """Measured data that are calibrated as a whole, and the results that are wanted; they go to `outputs.runs`."""
 
     calfits: bool = Field(False, description="Also write the gains as calfits.")
-    gain_errors: bool = Field(True, description="Give gains their errors by noise, which cost more than fast solves.")
+    gain_errors: bool = Field(True, description="Give gains their errors by noise.")
     expected_loss: bool = Field(False, description="Also write the signal loss that the fit is expected to cause.")
 
 
@@ -173,7 +173,8 @@ class DataCalibration(DataStudy):
     @cached_property
     def figures(self) -> list[Task]:
         """The diagnostics."""
-        return [figure_task(FIGURES.make(FIGURE), {"": self.graph}, (), {})]
+        figure = FIGURES.make({"kind": FIGURE, "gain_errors": self.file.gain_errors})
+        return [figure_task(figure, {"": self.graph}, (), {})]
 
     @cached_property
     def tables(self) -> list[Task]:

@@ -34,6 +34,7 @@ def diagnostics(last_loss: float, lowest_chi2: float, strongest: float) -> Diagn
         frequency=frequency,
         antennas=names[:8],
         gains=gains,
+        errors=np.full((2, 8, CHANNELS), 0.05),
         losses=(np.geomspace(1, last_loss, 12),) * 3,
         converged=np.ones(3, bool),
         chi2_antennas=names,

@@ -20,7 +20,7 @@ from calstudy.verdicts.criterion import Verdict
 
 STEPS = ["-1", "0.0", "0.1", "0.2", "1.0", "2.0", "2.1", "2.2", "2.3", "2.4", "3.0", "4.0", "4.1"]
 KNOWN_FAILURES = {"2.1 fitted"}
-"""What fails, and why: docs/validation.md."""
+"""What fails, and why: experiments/validation/README.md."""
 NOT_AT_THIS_SCALE = {"4.0", "4.1"}
 """Sixteen antennas lose up to a third of the signal to gains and flux scale; the full scale decides."""
 QUICK = ["0.0", "0.1", "2.1"]
