@@ -163,7 +163,7 @@ def test_gains_of_other_channels_or_antennas_are_refused(template, tmp_path):
     with pytest.raises(InputError, match=r"no solution for antenna\(s\) 6"):
         gains_for(unity.select(antenna_nums=list(range(6)), inplace=False), template)
     (tmp_path / "noise.calh5").write_bytes(b"no gains")
-    with pytest.raises(InputError, match=r"corruption\.effects: path = '.*noise.calh5': not a readable CalH5"):
+    with pytest.raises(InputError, match=r"corruption\.effects: path = '.*noise.calh5': not a readable file of CalH5"):
         draw_truth(FileGains(path=tmp_path / "noise.calh5"), Observation(template))
 
 

@@ -158,7 +158,7 @@ def test_words_for_channels_keep_their_keys_and_anything_else_is_refused_in_one_
     assert keyed("delays") == {"kind": "random-walk", "channels": {"kind": "delays"}}
     effect = {"kind": "per-channel-gains", "drift": {"kind": "jumps", "channels": {"kind": "delays"}}}
     data = override(tiny(tmp_path), "corruption.effects", [effect])
-    allowed = "(allowed: common, independent, polynomial, delays)"
+    allowed = "(allowed: common, independent, polynomial, delays, correlated)"
     for channels, told in (
         ("comn", "drift.channels: 'comn' is not a choice, did you mean 'common'? " + allowed),
         ({"kind": "delays", "max_delay": "-1 ns"}, "drift.channels.max_delay = '-1 ns': must be greater than 0 s"),
