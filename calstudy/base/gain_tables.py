@@ -119,7 +119,7 @@ class GainTable:
         unknown = [name for name in self.antennas if name not in known]
         if unknown:
             raise InputError(
-                f"antenna {unknown[0]!r} is none of the data, whose names are {', '.join(list(known)[:3])}, ...; "
+                f"the data have no antenna {unknown[0]!r}; their names are {', '.join(list(known)[:3])}, ...; "
                 "antennas must have the same names"
             )
         return np.array([known[name] for name in self.antennas])

@@ -6,19 +6,13 @@ by g_a g_b*.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.gain_formats import find_reader
-from calstudy.base.gain_tables import GainTable
 from calstudy.base.visibilities import antenna_pairs, positions
 
-CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
-"""Package that reads and writes CASA tables and measurement sets."""
 SAME_CHANNEL = 0.1
 """Channels of two files are the same if they differ by less than this, in units of their width."""
 
@@ -26,56 +20,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pyuvdata import UVCal, UVData
-
-
-def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -> UVCal:
-    """Read gains in any format; `where` names the source of the path in errors.
-
-    `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Raises InputError
-    if the file does not exist, has none of the formats, takes data from other files, does not fit the template, or is a
-    CASA table and the package that reads it is missing.
-    """
-    found = read_gain_file(path, where)
-    if not isinstance(found, GainTable):
-        return found
-    if template is None:
-        raise InputError(
-            f"{where} = {str(path)!r}: is understood only together with the data that it is for; give a CalH5 file"
-        )
-    try:
-        return found.uvcal(template)
-    # pyuvdata refuses axes that disagree, such as times that overlap.
-    except ValueError as error:
-        raise InputError(f"{where} = {str(path)!r}: {error}") from None
-
-
-def read_gain_file(path: Path, where: str) -> UVCal | GainTable:
-    """Read gains without the data that they are for; see `read_gains`."""
-    from pyuvdata import UVCal
-
-    if path.is_dir() and find_spec("casacore") is None:
-        raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
-    if not path.exists():
-        raise InputError(f"{where} = {str(path)!r}: no such file or folder")
-    require_self_contained(path)
-    kind = "CASA table of gains" if path.is_dir() else "file of CalH5, calfits, H5Parm, hyperdrive or calibrate"
-    try:
-        if (reader := find_reader(path)) is None:
-            return UVCal.from_file(str(path))
-        kind, read = reader
-        return read(path)
-    # The readers raise the errors of their libraries; the user must correct a file that cannot be read.
-    except (OSError, ValueError, LookupError, RuntimeError, TypeError, AttributeError) as error:
-        raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
-
-
-def read_gain_pair(first: Path, second: Path) -> tuple[UVCal, UVCal]:
-    """Read two files of gains to be compared; raises InputError as `read_gains`, which has one explain the other."""
-    names = ("the first file", "the second file")
-    found = [read_gain_file(path, name) for path, name in zip((first, second), names, strict=True)]
-    whole = next((cal for cal in found if not isinstance(cal, GainTable)), None)
-    one, other = (read_gains(path, name, whole) for path, name in zip((first, second), names, strict=True))
-    return one, other
 
 
 def at_common_channels(first: UVCal, second: UVCal) -> tuple[UVCal, UVCal]:

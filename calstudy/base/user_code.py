@@ -135,10 +135,6 @@ def load_file(path: Path) -> ModuleType:
     return module
 
 
-_LATER: dict[str, Path] = {}
-"""Modules that functions of users' files import when they are called, by name."""
-
-
 @contextmanager
 def _modules_beside(path: Path, beside: dict[str, Path]) -> Iterator[None]:
     """Import these modules of a file's folder in the block, where others of the same name may have been imported.
@@ -147,6 +143,9 @@ def _modules_beside(path: Path, beside: dict[str, Path]) -> Iterator[None]:
     """
     own = {name: found for name, found in beside.items() if not _is_installed(name.partition(".")[0])}
     later = {name for file in (path, *own.values()) for name in _imported(file, in_functions=True)} & own.keys()
+    if later:
+        # They may import any of the others, and as late.
+        later = set(own)
     for name in own:
         other = _LATER.get(name) or (_file_of(name) if name in later else None)
         if other is not None and other.is_file() and digest_file(other) != digest_file(own[name]):
@@ -158,16 +157,14 @@ def _modules_beside(path: Path, beside: dict[str, Path]) -> Iterator[None]:
     roots = {name.partition(".")[0] for name in own}
     for name in [name for name in sys.modules if name.partition(".")[0] in roots]:
         del sys.modules[name]
-    folder = str(path.parent)
-    if own and folder not in sys.path:
-        # At the end, for imports in functions: no file of the folder replaces an installed package.
-        sys.path.append(folder)
     finder = _Beside(own)
     sys.meta_path.insert(0, finder)
     try:
         yield
     finally:
         sys.meta_path.remove(finder)
+        if _CALLED not in sys.meta_path:
+            sys.meta_path.insert(0, _CALLED)
 
 
 class _Beside(MetaPathFinder):
@@ -181,6 +178,11 @@ class _Beside(MetaPathFinder):
         return importlib.util.spec_from_file_location(fullname, file) if (file := self.files.get(fullname)) else None
 
 
+_LATER: dict[str, Path] = {}
+"""Modules that functions of users' files import when they are called, by name."""
+_CALLED = _Beside(_LATER)
+
+
 def _file_of(module: str) -> Path | None:
     file = getattr(sys.modules.get(module), "__file__", None)
     return None if file is None else Path(file)
@@ -190,7 +192,9 @@ def _is_installed(name: str) -> bool:
     """Return whether a module belongs to Python or to an installed package."""
     if name in sys.stdlib_module_names:
         return True
-    spec = PathFinder.find_spec(name, [place for place in sys.path if "site-packages" in place])
+    spec = PathFinder.find_spec(
+        name, [place for place in sys.path if "site-packages" in place or "dist-packages" in place]
+    )
     return spec is not None
 
 

@@ -174,5 +174,4 @@ def channels_per_block(frequencies: np.ndarray, width: float) -> int:
     """Return how many channels, at least one, a block has that is `width` Hz wide; frequencies are in Hz."""
     if len(frequencies) == 1:
         return 1
-    channel = (frequencies[-1] - frequencies[0]) / (len(frequencies) - 1)
-    return max(1, round(width / channel))
+    return max(1, round(width / np.abs(np.diff(frequencies)).min()))

@@ -2,7 +2,7 @@
 
 Paper Eq. FGMODEL models each intrinsic visibility as a sum of DPSS (Slepian 1978) whose delays reach the horizon of its
 baseline. Half-widths are rounded up to a step, so that baselines fall into buckets with one basis each and no basis is
-padded with zeros for others.
+padded with zeros.
 
 The sequences are those of the band with data. Sequences of a wider band, cut at its flagged edges, follow smooth gains
 common to all antennas: with two flagged channels at either end of 96, such gains are wrong by a tenth.
@@ -200,9 +200,10 @@ def make_basis(
         orthonormal vectors.
     band : the channels that foregrounds are modelled in; vectors are zero in the others
     """
-    modelled = np.asarray(frequencies, float)[band]
-    grid = channel_grid(modelled)
-    width, n_modelled = grid.width, len(modelled)
+    whole = channel_grid(np.asarray(frequencies, float))
+    positions = whole.positions[band] - whole.positions[band][0]
+    grid = ChannelGrid(whole.width, int(positions[-1]) + 1, positions)
+    width, n_modelled = grid.width, len(positions)
     half_widths = delay_half_widths(lengths, settings)
     buckets = []
     for half_width in np.unique(half_widths):

@@ -29,7 +29,7 @@ LEAST = 3
 class Boards(Section):
     """Which antennas share a board of the correlator, and which channels a block."""
 
-    antennas: int = Field(3, ge=1, description="How many consecutive antennas of the data share a board.")
+    per_board: int = Field(3, ge=1, description="How many consecutive antennas of the data share a board.")
     block: Frequency = Field(
         11.71875e6,
         gt=0,
@@ -46,17 +46,17 @@ class Boards(Section):
 
     def refusal(self, frame: Frame) -> str | None:
         """Return a sentence if there are too few boards."""
-        count = -(-frame.n_antennas // self.antennas)
+        count = -(-frame.n_antennas // self.per_board)
         if count >= LEAST:
             return None
         return (
-            f"boards.antennas: {frame.n_antennas} antennas are on {count} {'board' if count == 1 else 'boards'}, and "
+            f"boards.per_board: {frame.n_antennas} antennas are on {count} {'board' if count == 1 else 'boards'}, and "
             f"{LEAST} are needed; it must be at most {(frame.n_antennas - 1) // (LEAST - 1)}"
         )
 
     def within(self, frame: Frame) -> np.ndarray:
         """Whether the antennas of each baseline share a board, bool, (Nbls,)."""
-        first, second = frame.antennas.T // self.antennas
+        first, second = frame.antennas.T // self.per_board
         return first == second
 
     def corrected(
@@ -118,7 +118,7 @@ class Boards(Section):
         from hera_cal.skycal import estimate_SNAP_decoherence
 
         channels = channels_per_block(frame.frequencies, self.block)
-        boards = np.arange(len(gains)) // self.antennas
+        boards = np.arange(len(gains)) // self.per_board
         names = [(a, f"J{p}") for a in range(len(gains)) for p in range(gains.shape[3])]
         spectra, weights = ({(a, feed): v[a, :, :, int(feed[1:])].T for a, feed in names} for v in (gains, information))
         try:

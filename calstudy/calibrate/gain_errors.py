@@ -45,7 +45,7 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.gain_variances import Alignment, as_a_whole, by_antenna, by_channel, pair
-from calstudy.calibrate.problem import CalibrationProblem, gain_products
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
 from calstudy.calibrate.tangent_space import SPAN_CUTOFF, TangentSpace
 
 ORDERS = 3
@@ -54,8 +54,8 @@ MOST_UNKNOWNS = 2048
 """Largest number of real unknowns, besides smooth ones, whose matrix is inverted as a whole."""
 TURNS_PER_DAY = 1.00274
 """Of the sky."""
-SIMILAR_DEVIATION = 0.05
-"""Relative change of an estimated deviation of the foregrounds that changes errors by less."""
+SIMILAR = 0.05
+"""Relative change of deviations of the foregrounds, or of the weights, that changes errors by less."""
 NoiseFrom = Literal["weights", "residual"]
 
 
@@ -178,6 +178,14 @@ def gain_errors(
     )
 
 
+class _Last(NamedTuple):
+    structure: FitStructure
+    weights: np.ndarray
+    deviations: tuple[float, float]
+    time: float
+    absorbed: Absorption
+
+
 class ErrorsInTime:
     """Errors of solves of one polarization, in the order of time; see `gain_errors`.
 
@@ -190,28 +198,34 @@ class ErrorsInTime:
     def __init__(self, frequencies: np.ndarray, longest: float) -> None:
         self._frequencies = frequencies
         self._fringe = SPEED_OF_LIGHT / (frequencies.max() * longest) / (2 * np.pi * TURNS_PER_DAY)
-        self._last: tuple[CalibrationProblem, float, Absorption] | None = None
+        self._last: _Last | None = None
 
-    def of(self, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, time: float) -> GainErrors | str:
-        """Return the errors of a solve at a time, a Julian date in days."""
+    def of(
+        self, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, time: float, settled: bool = True
+    ) -> GainErrors | str:
+        """Return the errors of a solve at a time, a Julian date in days.
+
+        What foregrounds absorb is kept from solves that have settled.
+        """
         absorbed = self._known(problem, time)
         found = gain_errors(problem, gains, model, self._frequencies, absorbed)
-        if absorbed is None and isinstance(found, GainErrors):
-            self._last = problem, time, found.absorbed
+        if absorbed is None and settled and isinstance(found, GainErrors):
+            self._last = _Last(problem.structure, problem.weights, problem.deviations, time, found.absorbed)
         return found
 
     def _known(self, problem: CalibrationProblem, time: float) -> Absorption | None:
         """Return what foregrounds absorb, if it was computed for the same samples and prior, within a fringe."""
-        if self._last is None:
+        last = self._last
+        if last is None or not 0 <= time - last.time < self._fringe or problem.structure != last.structure:
             return None
-        last, then, absorbed = self._last
-        alike = (
-            0 <= time - then < self._fringe
-            and problem.structure == last.structure
-            and np.array_equal(problem.weights > 0, last.weights > 0)
-            and np.allclose(problem.deviations, last.deviations, rtol=SIMILAR_DEVIATION)
-        )
-        return absorbed if alike else None
+        if not np.array_equal(problem.weights > 0, last.weights > 0):
+            return None
+        # A finite prior is weighed against the noise.
+        if problem.structure.prior != "none":
+            levels = [np.mean(weights) for weights in (problem.weights, last.weights)]
+            if not np.allclose([*problem.deviations, levels[0]], [*last.deviations, levels[1]], SIMILAR, atol=0):
+                return None
+        return last.absorbed
 
 
 def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:

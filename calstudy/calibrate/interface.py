@@ -77,8 +77,8 @@ class Calibration:
     baselines
         Mask of the calibrated baselines, bool, (Nbls,); None for all. Model and flags cover only these.
     closure
-        Factors c of baselines that are no product of gains, V = c_ab g_a g_b* F, real or complex, like `model`; None
-        for one.
+        Factors c of baselines that are no product of gains, V = c_ab g_a g_b* F, real or complex, like `model`; None:
+        all are 1. They are for simulated data.
     """
 
     gains: np.ndarray | UVCal

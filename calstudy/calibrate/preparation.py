@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import gains_for, read_gains
+from calstudy.base.gain_files import read_gains
+from calstudy.base.gains import gains_for
 from calstudy.base.observation import Observation
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
@@ -58,6 +59,20 @@ class PreparedFit:
     used: np.ndarray
     start: np.ndarray
     sky: np.ndarray | None
+    _of_bands: dict[tuple[int, int], FitStructure] = field(default_factory=dict, repr=False)
+
+    def structure_between(self, first: int, end: int, settings: GainFit) -> FitStructure:
+        """Return the structure of an integration with data in channels `first` to `end` - 1.
+
+        It is that of all channels where foregrounds are not free: a finite prior is the same in a part of the band.
+        Raises InputError as `make_structure`.
+        """
+        free = isinstance(settings, ForegroundFit) and not settings.frozen and not settings.foreground_prior.finite
+        if not free or (first, end) == (0, self.structure.n_frequencies):
+            return self.structure
+        if (first, end) not in self._of_bands:
+            self._of_bands[first, end] = make_structure(self.data, settings, slice(first, end))
+        return self._of_bands[first, end]
 
 
 def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTHING) -> PreparedFit:
@@ -115,7 +130,7 @@ def problem_at(
 def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:
     """Return the problem of some consecutive integrations together, or the reason why there is none.
 
-    Weights that come from the gains are those of unity gains. Foregrounds are modelled from the first channel with
+    Weights that come from the gains are those of unity gains. Free foregrounds are modelled from the first channel with
     data to the last.
     """
 
@@ -126,11 +141,8 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
     with_data = np.flatnonzero(weights.any(axis=0))
     if not with_data.size:
         return "every sample is flagged or has no weight"
-    band = slice(int(with_data[0]), int(with_data[-1]) + 1)
     try:
-        one = (
-            prepared.structure if band == slice(0, weights.shape[1]) else make_structure(prepared.data, settings, band)
-        )
+        one = prepared.structure_between(int(with_data[0]), int(with_data[-1]) + 1, settings)
     except InputError as error:
         return f"between flagged edges of the band: {error}"
     structure = repeat_structure(one, times.stop - times.start)

@@ -65,7 +65,8 @@ Output = Annotated[Path, typer.Option(help="Folder for the results.")]
 Also = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="FORMAT", help="Also write the gains as calfits, h5 (H5Parm), fits (hyperdrive) or bin (calibrate)."
+        metavar="FORMAT",
+        help="Also write the gains as calfits, h5parm, hyperdrive (FITS) or mwaocal (.bin).",
     ),
 ]
 ExpectedLoss = Annotated[
@@ -271,7 +272,8 @@ def compare_gains(
     Antennas, feeds and channels that are in one file only are left out. One phase in every channel and one real
     scale are removed in every integration, because no data determine them.
     """
-    from calstudy.base.gains import at_common_channels, read_gain_pair
+    from calstudy.base.gain_files import read_gain_pair
+    from calstudy.base.gains import at_common_channels
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.plotting import style
     from calstudy.plotting.save import figure_arrays, save_figure

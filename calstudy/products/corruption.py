@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from calstudy.base.gains import make_uvcal, read_gains
+from calstudy.base.gain_files import read_gains
+from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, positions, to_cube

@@ -121,7 +121,8 @@ class OfSolves(Calibrated):
                 found = RAN_AWAY
             else:
                 model = cube[times, :, :, place].reshape(problem.visibilities.shape)
-                found = errors[place].of(problem, gains, model, data.times[times.start])
+                settled = solve.status == "converged"
+                found = errors[place].of(problem, gains, model, data.times[times.start], settled)
             yield SolvedGains(rows, times, place, gains, found)
 
     def _cost(self) -> Cost:

@@ -19,7 +19,7 @@ from pyuvdata import UVData, utils
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.gains import CASACORE
+from calstudy.base.gain_files import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.layouts import make_layout

@@ -43,8 +43,8 @@ from calstudy.studies.folder import LOG, log_to, publish
 from calstudy.studies.study import RunProducts, Study, make
 
 FIGURE, UNFINISHED = "diagnostics", ".unfinished"
-GainFormat = Literal["calfits", "h5", "fits", "bin"]
-"""Suffix of gains in other formats than CalH5."""
+GainFormat = Literal["calfits", "h5parm", "hyperdrive", "mwaocal"]
+SUFFIXES = {"h5parm": ".h5", "hyperdrive": ".fits", "mwaocal": ".bin"}
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
@@ -71,6 +71,8 @@ class DataFile(Section):
     def _calibration_is_of_measured_data(self) -> Self:
         if self.calibration.assumed:
             raise fault("calibration.assumed", "is for simulated data; give the sky model as observed.sky_model")
+        if getattr(self.calibration, "boards", None) is not None:
+            raise fault("calibration.boards", "is for simulated data so far; correct losses of measured data before")
         if isinstance(self.calibration, ByFile) and self.calibration.folder is not None:
             raise fault("calibration.folder", "is for simulated data; give gains of measured data as calibration.gains")
         return self
@@ -151,7 +153,8 @@ class CalibrationFile(DataFile):
     """Measured data that are calibrated as a whole, and the results that are wanted; they go to `outputs.runs`."""
 
     also: Annotated[tuple[GainFormat, ...], Field(strict=False)] = Field(
-        (), description="Also write the gains as calfits, H5Parm (h5), or for hyperdrive (fits) or calibrate (bin)."
+        (),
+        description="Also write the gains as calfits, H5Parm, FITS of hyperdrive, or `.bin` of calibrate (mwaocal).",
     )
     gain_errors: bool = Field(True, description="Give gains their errors by noise.")
     expected_loss: bool = Field(False, description="Also write the signal loss that the fit is expected to cause.")
@@ -168,9 +171,9 @@ class DataCalibration(DataStudy):
             label = content.calibration.label
             raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
         facts = read_selected(content, content.observed.data, even=False)
-        if {"fits", "bin"} & set(content.also) and facts.frame.n_polarizations != 2:
+        if {"hyperdrive", "mwaocal"} & set(content.also) and facts.frame.n_polarizations != 2:
             raise InputError(
-                "also: fits and bin hold gains of xx and yy, and the data have only one; take calfits or h5"
+                "also: hyperdrive and mwaocal hold gains of xx and yy, and the data have one; take calfits or h5parm"
             )
         return cls(content, Parts({WHOLE: facts}))
 
@@ -209,7 +212,7 @@ class DataCalibration(DataStudy):
 
         Raises InputError if a file cannot be used.
         """
-        from calstudy.base.gains import read_gains
+        from calstudy.base.gain_files import read_gains
         from calstudy.calibrate.weights import conspicuous
 
         data, _, notes = observed(self.graph, WHOLE).read()
@@ -259,14 +262,15 @@ class DataCalibration(DataStudy):
         """Write the gains of a folder in other formats."""
         from pyuvdata import UVCal
 
-        from calstudy.base.gain_formats import write_gains
+        from calstudy.base.gain_files import write_gains
 
-        for suffix in self.file.also:
-            gains, path = UVCal.from_file(work / GAINS), (work / GAINS).with_suffix(f".{suffix}")
-            if suffix == "calfits":
-                gains.write_calfits(str(path))
+        if self.file.also:
+            gains = UVCal.from_file(work / GAINS)
+        for kind in self.file.also:
+            if kind == "calfits":
+                gains.write_calfits(str((work / GAINS).with_suffix(".calfits")))
             else:
-                write_gains(gains, path)
+                write_gains(gains, (work / GAINS).with_suffix(SUFFIXES[kind]))
 
     def _solution(self, made: RunProducts, solved: Mapping[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         """Return the request, the changes of the data, what stands out, and every solve, as plain JSON types."""

@@ -16,7 +16,7 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
-from calstudy.base.gains import CASACORE
+from calstudy.base.gain_files import CASACORE
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world

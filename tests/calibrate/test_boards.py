@@ -18,7 +18,7 @@ from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, DpssSmoothing, Solve
 
 NOISE, CHANNELS = 1e-4, 16
-BOARDS = {"antennas": 3, "block": "6.4 MHz", "detection": 0.0}
+BOARDS = {"per_board": 3, "block": "6.4 MHz", "detection": 0.0}
 """Sixteen channels of 400 kHz: four blocks. All losses are kept, for none is zero."""
 
 
@@ -111,8 +111,8 @@ def test_gains_are_smooth_once_the_losses_are_out(toy, losses):
 
 
 def test_too_few_boards_are_refused(toy):
-    with pytest.raises(InputError, match=r"boards.antennas: 12 antennas are on 2 boards, and 3 are needed; .* most 5$"):
-        calibrated(toy, np.zeros((4, 4)), boards={"antennas": 6})
+    with pytest.raises(InputError, match=r"boards.per_board: 12 antennas are on 2 boards, and 3 are needed; .* most 5$"):
+        calibrated(toy, np.zeros((4, 4)), boards={"per_board": 6})
 
 
 class Closing(Calibrator):

@@ -17,7 +17,7 @@ from test_calamity import make_uvdata
 
 import calstudy
 from calstudy.base.errors import InputError
-from calstudy.base.gains import read_gains
+from calstudy.base.gain_files import read_gains
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
 from calstudy.interface import CalibratedData
@@ -47,7 +47,7 @@ def data(toy, tmp_path):
 def finished(toy, tmp_path_factory):
     """The folder of data, with all that the command can write in its folder ``out``, and what it told."""
     folder, told = tmp_path_factory.mktemp("calibrated"), io.StringIO()
-    wanted = ["--also", "calfits", "--also", "h5", "--expected-loss"]
+    wanted = ["--also", "calfits", "--also", "h5parm", "--expected-loss"]
     arguments = [write_data(toy, folder), *OPTIONS, "--output", "out", *wanted]
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(told), redirect_stderr(told):
         patch.setattr(sys, "argv", ["calstudy", "calibrate", *map(str, arguments)])
@@ -206,7 +206,7 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
         (["data.uvh5", "--weights", "no.h5"], "--weights no.h5: neither gains, flags, nsamples or autos, nor a file"),
         (["data.uvh5", "--select", "antennas=3"], "--select antennas: '3' is not in the data"),
         (["data.uvh5", "--buffer", "2000 ns"], "fills all 64 channels"),
-        (["data.uvh5", "--also", "bin", *OPTIONS], "--also fits and bin hold gains of xx and yy"),
+        (["data.uvh5", "--also", "mwaocal", *OPTIONS], "--also hyperdrive and mwaocal hold gains of xx and yy"),
         (["data.uvh5", "--also", "uvfits", *OPTIONS], "--also 'uvfits': not a choice"),
         (["data.uvh5", "--set", "autos=true"], "the data hold no autocorrelations"),
         (

@@ -14,8 +14,8 @@ from test_calamity import make_uvdata
 from toy import complex_normal, make_toy, scattered
 
 from calstudy.base.errors import InputError
-from calstudy.base.gain_formats import write_gains
-from calstudy.base.gains import make_uvcal, read_gain_pair, read_gains
+from calstudy.base.gain_files import read_gain_pair, read_gains, write_gains
+from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
 from calstudy.calibrate.calibrators import ddecal
@@ -251,7 +251,7 @@ def test_they_are_compared_with_gains_that_know_the_telescope(world, tmp_path, n
         assert np.allclose(first.gain_array, second.gain_array, rtol=1e-12)
         assert np.array_equal(first.ant_array, second.ant_array)
         assert np.array_equal(first.freq_array, second.freq_array)
-    with pytest.raises(InputError, match="is understood only together with the data that it is for; give a CalH5"):
+    with pytest.raises(InputError, match="needs the data that it is for; give a CalH5"):
         read_gain_pair(paths[0], paths[0])
 
 
@@ -329,7 +329,7 @@ FAULTS = {
     "channels.bin": (header(counts=(1, 5, 32, 4)), "has 32 channels without frequencies, and the data have 64"),
     "times.bin": (write_bin, "has 2 solutions in time and not their times; calibrate all integrations together"),
     "antennas.fits": (without_names, "has gains of 4 antennas without names"),
-    "names.fits": (other_names, "antenna 'Tile0' is none of the data, whose names are ant10, ant12, ant14"),
+    "names.fits": (other_names, "the data have no antenna 'Tile0'; their names are ant10, ant12, ant14"),
     "rows.fits": (short_table, "TILES has 5 rows, and SOLUTIONS 4"),
     "overlap.fits": (overlapping, "Some time_ranges overlap"),
     "image.fits": (flat_image, "SOLUTIONS has shape .5, 64, 8., and not .times, tiles, channels, 8"),

@@ -10,7 +10,7 @@ from scipy.constants import Boltzmann, speed_of_light
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError
-from calstudy.base.gains import read_gains
+from calstudy.base.gain_files import read_gains
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.settings import AutoWeights

@@ -165,6 +165,21 @@ def test_files_import_the_modules_of_their_own_folders(tmp_path, monkeypatch, fo
     assert [(module.X, module.OTHER) for module in found] == [(1, 1), (2, 2)]
 
 
+def test_a_function_imports_the_module_of_its_own_folder_when_it_is_called(tmp_path):
+    texts = {
+        "first": "from third_beside import Z\n",
+        "second": "def x():\n    import called_beside\n\n    return called_beside.X\n",
+    }
+    for number, (place, text) in enumerate(texts.items()):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "other_beside.py").write_text(f"Y = {number}\n", encoding="utf-8")
+        (tmp_path / place / "third_beside.py").write_text("Z = 0\n", encoding="utf-8")
+        (tmp_path / place / "called_beside.py").write_text("from other_beside import Y\n\nX = Y\n", encoding="utf-8")
+        (tmp_path / place / "mine.py").write_text(text, encoding="utf-8")
+    load_file(tmp_path / "first" / "mine.py")
+    assert load_file(tmp_path / "second" / "mine.py").x() == 1
+
+
 @pytest.mark.parametrize("order", [("late", "early"), ("early", "late")])
 def test_imports_in_functions_of_modules_with_one_name_are_refused(tmp_path, order):
     name = f"beside_{order[0]}"

@@ -13,7 +13,8 @@ from observations import small_instrument
 from test_by_file import row
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import make_uvcal, read_gains
+from calstudy.base.gain_files import read_gains
+from calstudy.base.gains import make_uvcal
 from calstudy.base.table import Table, one_line
 from calstudy.base.visibilities import from_cube
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, read_manifest

@@ -124,8 +124,7 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    # Foregrounds are modelled between the flagged edges of the band since 4.
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 3
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -138,8 +137,7 @@ class Unified(_LeastSquares, ForegroundFit):
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    # Foregrounds are modelled between the flagged edges of the band since 4.
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 3
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -150,8 +148,6 @@ class Unified(_LeastSquares, ForegroundFit):
 class EmpiricalBayes(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors fill the modelled delays; the data tell their size."""
 
-    # Foregrounds are modelled between the flagged edges of the band since 2.
-    version: ClassVar[int] = 2
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"

@@ -19,7 +19,8 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import gains_for, read_gains
+from calstudy.base.gain_files import read_gains
+from calstudy.base.gains import gains_for
 from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Fraction, Frequency, Time
 from calstudy.base.visibilities import antenna_rows

@@ -1,7 +1,7 @@
-"""Gains in files of DP3 (H5Parm), hyperdrive (FITS) and calibrate of mwa-reduce (`.bin`).
+"""Files of gains: those of pyuvdata, DP3 (H5Parm), hyperdrive (FITS) and calibrate of mwa-reduce (`.bin`).
 
-Such a file has antennas by name or only by order, no positions, and perhaps neither channels nor times: only with the
-data that it is for does it become a UVCal.
+A file of the last three has antennas by name or only by order, no positions, and perhaps neither channels nor times:
+only with the data that it is for does it become a UVCal.
 
 All three describe visibilities as they are in measurement sets and UVFITS files, which are the complex conjugates of
 pyuvdata's. H5Parm holds gains, as here; hyperdrive and calibrate hold Jones matrices J that calibrate data, by
@@ -12,19 +12,23 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gain_tables import PARALLEL_HANDS, SECONDS_PER_DAY, GainTable
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import h5py
-    from pyuvdata import UVCal
+    from pyuvdata import UVCal, UVData
 
+CASACORE = "python-casacore, which is not installed: pip install 'calstudy[ms]'"
+"""Package that reads and writes CASA tables and measurement sets."""
 MJD_ZERO = 2400000.5
 """Julian date of the modified Julian date zero."""
 FEEDS = {**PARALLEL_HANDS, "X": PARALLEL_HANDS["XX"], "Y": PARALLEL_HANDS["YY"]}
@@ -38,6 +42,57 @@ HEADER = struct.Struct("<8s6I2d")
 H5PARM_AXES = ("ant", "freq", "time", "pol")
 
 Reader = Callable[["Path"], GainTable]
+
+
+def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -> UVCal:
+    """Read gains in any format; `where` names the source of the path in errors.
+
+    `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Raises InputError
+    if the file does not exist, has none of the formats, takes data from other files, does not fit the template, or is a
+    CASA table and the package that reads it is missing.
+    """
+    found = read_gain_file(path, where)
+    if not isinstance(found, GainTable):
+        return found
+    if template is None:
+        raise InputError(f"{where} = {str(path)!r}: needs the data that it is for; give a CalH5 file")
+    try:
+        return found.uvcal(template)
+    # pyuvdata refuses axes that disagree, such as times that overlap.
+    except ValueError as error:
+        raise InputError(f"{where} = {str(path)!r}: {error}") from None
+
+
+def read_gain_file(path: Path, where: str) -> UVCal | GainTable:
+    """Read gains without the data that they are for; see `read_gains`."""
+    from pyuvdata import UVCal
+
+    if path.is_dir() and find_spec("casacore") is None:
+        raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
+    if not path.exists():
+        raise InputError(f"{where} = {str(path)!r}: no such file or folder")
+    require_self_contained(path)
+    kind = "CASA table of gains" if path.is_dir() else "file of CalH5, calfits, H5Parm, hyperdrive or calibrate"
+    try:
+        if (reader := find_reader(path)) is None:
+            return UVCal.from_file(str(path))
+        kind, read = reader
+        return read(path)
+    # The readers raise the errors of their libraries; the user must correct a file that cannot be read.
+    except (OSError, ValueError, LookupError, RuntimeError, TypeError, AttributeError) as error:
+        raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
+
+
+def read_gain_pair(first: Path, second: Path) -> tuple[UVCal, UVCal]:
+    """Read two files of gains to be compared; axes missing in one are taken from the other.
+
+    Raises InputError as `read_gains`.
+    """
+    names = ("the first file", "the second file")
+    found = [read_gain_file(path, name) for path, name in zip((first, second), names, strict=True)]
+    whole = next((cal for cal in found if not isinstance(cal, GainTable)), None)
+    one, other = (read_gains(path, name, whole) for path, name in zip((first, second), names, strict=True))
+    return one, other
 
 
 def find_reader(path: Path) -> tuple[str, Reader] | None:
@@ -284,7 +339,7 @@ def _write_h5parm(table: GainTable, path: Path) -> None:
 
 
 def _terminated(texts: list[str]) -> np.ndarray:
-    """Return texts that end with a zero byte: DP3 does not find antennas of other names."""
+    """Return texts that end with a zero byte: DP3 finds no antenna whose name lacks it."""
     return np.array(texts, f"S{max(len(text) for text in texts) + 1}")
 
 
@@ -292,7 +347,10 @@ WRITERS = {".h5": _write_h5parm, ".fits": _write_hyperdrive, ".bin": _write_mwao
 
 
 def _to_jones(table: GainTable, path: Path) -> np.ndarray:
-    """Return Jones matrices that calibrate, complex, (Ntimes, Nants, Nfreqs, 4); raises InputError if a feed lacks."""
+    """Return Jones matrices that calibrate, complex, (Ntimes, Nants, Nfreqs, 4).
+
+    Raises InputError if a feed is missing.
+    """
     feeds = [] if table.feeds is None else table.feeds.tolist()
     if sorted(feeds) != sorted(LINEAR):
         raise InputError(f"{path}: a Jones matrix has gains of xx and yy, and these are of {len(feeds)} feed(s)")
