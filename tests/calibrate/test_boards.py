@@ -111,7 +111,8 @@ def test_gains_are_smooth_once_the_losses_are_out(toy, losses):
 
 
 def test_too_few_boards_are_refused(toy):
-    with pytest.raises(InputError, match=r"boards.per_board: 12 antennas are on 2 boards, and 3 are needed; .* most 5$"):
+    message = r"boards.per_board: 12 antennas are on 2 boards, and 3 are needed; .* most 5$"
+    with pytest.raises(InputError, match=message):
         calibrated(toy, np.zeros((4, 4)), boards={"per_board": 6})
 
 
