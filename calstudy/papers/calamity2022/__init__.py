@@ -201,7 +201,7 @@ def _other_solver(experiment: Experiment) -> str | None:
     solver = _solver(experiment)
     if not isinstance(solver, AdamaxSettings) or solver.learning_rate != PAPER_RATE:
         return f"calibration.solver is not the paper's (adamax at a constant rate of {PAPER_RATE})"
-    for name, wanted in (("keep", "last"), ("precision", "single"), ("warm_start", False)):
+    for name, wanted in (("keep", "last"), ("precision", "single")):
         if getattr(solver, name) != wanted:
             return f"calibration.solver.{name} is {getattr(solver, name)!r}, not the paper's {wanted!r}"
     if solver.max_steps < PAPER_STEPS:
