@@ -27,6 +27,8 @@ from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
 
+SEARCH_TOLERANCE = 1e-3
+"""Of solves from which a deviation is estimated that is not the last."""
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 UNRESOLVED_DEVIATION = (
     "the deviation of the foregrounds from the sky model is lost in rounding; "
@@ -34,9 +36,11 @@ UNRESOLVED_DEVIATION = (
 )
 
 
-def make_solver(settings: GainFit) -> Solver:
-    """Return the solver of the `calibration.solver` section."""
+def make_solver(settings: GainFit, tolerance: float | None = None) -> Solver:
+    """Return the solver of the `calibration.solver` section, with another tolerance if one is given."""
     solver = settings.solver
+    if tolerance is not None:
+        solver = solver.model_copy(update={"tolerance": tolerance})
     if isinstance(solver, GaussNewtonSettings):
         return GaussNewton(solver.tolerance, solver.max_steps, solver.precision)
     return Adamax(**solver.model_dump(exclude={"name", "warm_start"}))
@@ -147,12 +151,15 @@ class _Pass(NamedTuple):
 class _Passes:
     """Solves with weights from the gains, and deviations of the foregrounds, of the pass before, until both settle.
 
-    Settings ask for one of the two, or both. `seed` is that of the estimates.
+    Settings ask for one of the two, or both. `seed` is that of the estimates. A deviation has errors of some percent,
+    and needs no better solution than `SEARCH_TOLERANCE`: only the last pass has the tolerance of the solver.
     """
 
     def __init__(self, settings: GainFit, solver: Solver, seed: tuple[int, int]) -> None:
         self._weights = settings.weights if isinstance(settings.weights, GainWeights) else None
         self._estimated, self._solver, self._seed = settings.estimates_deviation, solver, seed
+        exact = not self._estimated or solver.tolerance >= SEARCH_TOLERANCE
+        self._search = solver if exact else make_solver(settings, SEARCH_TOLERANCE)
         passes = 0 if self._weights is None else self._weights.passes
         self._most = max(passes, PASSES) if self._estimated else passes
 
@@ -169,9 +176,11 @@ class _Passes:
         current = self._for_pass(problem, gains, deviations)
         done: list[_Pass] = []
         found: Estimate | None = None
-        change, anew = 0.0, True
+        change, anew, settled = 0.0, True, False
         while len(done) < self._most:
-            solution, warm, anew = _solve(current, self._solver, warm, anew)
+            last = settled or len(done) == self._most - 1
+            solver = self._solver if last else self._search
+            solution, warm, anew = _solve(current, solver, warm, anew)
             if done and not solution.record.usable:
                 break
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
@@ -184,7 +193,8 @@ class _Passes:
             change = 0.0 if self._weights is None else weight_change(current.weights, before.weights)
             settled = (self._weights is None or change < self._weights.tolerance) and (found is None or found.settled)
             # What follows from gains that are far from the solution leads away from it.
-            if settled or solution.record.status == "max-steps" or not (found is None or found.resolved):
+            far = solution.record.status == "max-steps" or not (found is None or found.resolved)
+            if far or (settled and solver is self._solver):
                 break
         return self._kept(done, change, found)
 

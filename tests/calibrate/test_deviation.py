@@ -14,6 +14,7 @@ from toy import HEX, complex_normal, make_toy, scattered
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube
+from calstudy.calibrate import calamity
 from calstudy.calibrate.calibrators.least_squares import DelayWeighted, SkyBased
 from calstudy.calibrate.deviation import estimate
 from calstudy.calibrate.execution import run_calibrator
@@ -228,6 +229,25 @@ def test_the_problem_of_a_solution_has_the_deviations_that_were_found():
     # The residual is at the minimum for these: coefficients and gains that the data determine do not move.
     again = solve(replace(problem, initial_gains=gains), GaussNewton(tolerance=1e-5))
     assert again.record.loss_history[-1] > 0.99 * again.record.loss_history[0]
+
+
+def test_rough_passes_lead_to_the_deviation_and_the_minimum_of_exact_ones(monkeypatch):
+    problem = measured(HEX, "both", (0.1, 0.2), 3)
+    exact = GaussNewton(tolerance=1e-6)
+    settings = DelayWeighted(
+        foreground_prior={"deviation": "estimated", "shared_deviation": "estimated"},
+        solver={"name": "gauss-newton", "tolerance": exact.tolerance},
+    )
+    rough = calamity._Passes(settings, exact, (1, 2)).solve(problem, None, None)
+    monkeypatch.setattr(calamity, "SEARCH_TOLERANCE", exact.tolerance)
+    fine = calamity._Passes(settings, exact, (1, 2)).solve(problem, None, None)
+    assert rough.solution.record.steps < 0.8 * fine.solution.record.steps
+    assert rough.solution.record.newton_decrement < exact.tolerance
+    # The estimates' own errors are some percent.
+    assert rough.deviations == pytest.approx(fine.deviations, rel=0.01)
+    losses = [found.solution.record.loss_history[-1] for found in (rough, fine)]
+    # A deviation that is off by a hundredth of itself changes the loss by its share of the prior's.
+    assert losses[0] == pytest.approx(losses[1], rel=0.01)
 
 
 def test_one_level_cannot_be_estimated_beside_a_fixed_one():

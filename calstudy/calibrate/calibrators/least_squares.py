@@ -148,6 +148,8 @@ class Unified(_LeastSquares, ForegroundFit):
 class EmpiricalBayes(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors fill the modelled delays; the data tell their size."""
 
+    # Only the last solve has the full tolerance since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"
