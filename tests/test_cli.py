@@ -156,8 +156,9 @@ def test_a_mistake_is_one_clear_sentence(tmp_path, monkeypatch, capsys, argument
     assert "Traceback" not in error
 
 
-def test_a_scheduler_that_is_not_there_is_one_clear_sentence(tmp_path):
+def test_a_scheduler_that_is_not_there_is_one_clear_sentence(tmp_path, monkeypatch):
     """In a process of its own: dask tries for a while, and leaves threads behind."""
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
     arguments = ["run", "tiny.yaml", "--scheduler", "tcp://127.0.0.1:1"]
     assert "tcp://127.0.0.1:1: cannot connect" in refused(calstudy(*arguments, cwd=tmp_path))

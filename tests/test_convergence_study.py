@@ -13,6 +13,8 @@ from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import run_study
 
+pytestmark = pytest.mark.chain
+
 DRAWN = True
 
 VARIANTS = {

@@ -13,6 +13,8 @@ import pytest
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import experiment_names, find_experiment, published, reference_folder
 
+pytestmark = pytest.mark.chain
+
 ROOT = Path(__file__).parents[1]
 SOURCES = ("calstudy", "experiments", "figures", "pyproject.toml", "README.md", "LICENSE")
 

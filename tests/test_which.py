@@ -85,6 +85,7 @@ def test_an_array_without_redundancy_loses_the_calibrator_that_needs_it():
     assert any(note.startswith("redcal cannot work in any world: ") for note in study.notes)
 
 
+@pytest.mark.chain
 def test_a_run_ends_with_an_answer(positions, capsys):
     tiny = (
         "instrument.channels.count=32",

@@ -362,7 +362,7 @@ def _client(workers: Workers) -> Iterator[Client]:
     path = Path(workers.scheduler)
     address = {"scheduler_file": str(path)} if path.is_file() else {"address": workers.scheduler}
     try:
-        client = Client(**address, timeout="20 s")
+        client = Client(**address)
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"--scheduler {workers.scheduler}: cannot connect ({error})") from None
     with client:

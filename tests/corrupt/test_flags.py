@@ -228,6 +228,7 @@ def expected_flags(uvd) -> np.ndarray:
     return flags
 
 
+@pytest.mark.chain
 def test_flags_reach_gains_residuals_averages_and_data_without_effects(run):
     _, made = run
     for name, file in (("solved", "residual.uvh5"), ("solved", "model.uvh5"), ("eor", "data.uvh5")):
@@ -266,6 +267,7 @@ def test_all_variants_have_the_same_baselines_so_that_spectra_compare(run):
     assert (made["transfer"] / "transfer.outside-wedge.h5").is_file()
 
 
+@pytest.mark.chain
 def test_figures_show_a_run_with_flags(run):
     from calstudy.experiment.model import FIGURES
     from calstudy.run.task import Job

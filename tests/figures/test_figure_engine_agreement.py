@@ -18,6 +18,8 @@ from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import run_study
 
+pytestmark = pytest.mark.chain
+
 INSTRUMENT = {
     "layout": {"kind": "mwa-compact-minredundant", "count": 6},
     "beam": {"kind": "gaussian"},

@@ -121,6 +121,7 @@ def test_a_plan_has_its_cost_and_its_refusal(reference, tmp_path, capsys):
     assert told == "calstudy: calibration.max_length: is exceeded by a baseline of 28 m\n"
 
 
+@pytest.mark.chain
 def test_a_run_uses_it_and_tells_its_status(reference, tmp_path, shared_store):
     (tmp_path / "store").symlink_to(shared_store)
     settings = {"calibrator": reference, "factor": 2.0, "status": "max-steps"}
@@ -147,6 +148,7 @@ def observed(tmp_path):
     return data, sky
 
 
+@pytest.mark.chain
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("status", "code"), [("converged", 0), ("stalled", 3)])
 def test_the_calibrate_command_uses_it(reference, observed, tmp_path, capsys, monkeypatch, status, code):
@@ -187,6 +189,7 @@ def test_the_calibrate_command_refuses_in_a_sentence(reference, observed, tmp_pa
     assert told in complaints[0], error
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("fault", "told"),
     [

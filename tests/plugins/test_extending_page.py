@@ -17,6 +17,8 @@ from calstudy.studies.load import load_study
 from calstudy.studies.reference import plugin_reference
 from calstudy.studies.study import run_study
 
+pytestmark = pytest.mark.chain
+
 # These change what is calibrated, and share nothing of it with other examples: one variant goes all the way.
 ALONE = ("A layout", "A beam", "An engine", "An effect", "A calibrator")
 FEWEST_VARIANTS = {

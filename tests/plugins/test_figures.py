@@ -89,6 +89,7 @@ def finished(folder) -> Run:
     return run_of(folder, "wedge", {"kind": f"{NAME}.py", "max_k": "0.6 h/Mpc"}, "layout")
 
 
+@pytest.mark.chain
 def test_it_is_drawn_into_the_run_folder_with_its_caption_in_the_order_of_the_file(finished):
     made = {path.name for path in (finished.folder / "figures").iterdir()}
     assert {f"{NAME}.{ending}" for ending in ("png", "pdf", "npz")} <= made
@@ -206,6 +207,7 @@ def test_what_goes_wrong_in_it_is_told_with_its_line(folder, fault, told):
     assert str(caught.value) == told
 
 
+@pytest.mark.chain
 def test_one_that_compares_members_of_a_collection_without_papers(folder):
     study_of(folder)
     (folder / "sizes.py").write_text(SIZES)

@@ -85,6 +85,7 @@ def finished(folder):
     return run_study(load_study(write(folder)), Budget(workers=1))
 
 
+@pytest.mark.chain
 def test_one_figure_is_drawn_of_each_member_and_of_all(finished):
     def arrays(folder: Path) -> dict[str, np.ndarray]:
         return RunFolder(folder).arrays()["seeds"]

@@ -71,6 +71,7 @@ def test_its_spectra_of_noise_agree_with_the_defaults(plugged):
     np.testing.assert_allclose(own.k_parallel, default.k_parallel, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.chain
 def test_all_spectra_of_a_run_are_made_with_it(plugged):
     experiment = with_estimator(plugged, plugged.settings())
     variants = {name: experiment.variants[name] for name in ("uncalibrated", "eor", "noise")}

@@ -106,6 +106,7 @@ def test_the_notebooks_calibrator_finds_the_gains(template):
     assert {record.status for record in hasty.solutions} == {"max-steps"}
 
 
+@pytest.mark.chain
 def test_a_study_of_own_code_runs_and_plays_no_part_of_the_paper(tmp_path):
     content = tiny(tmp_path)
     content["outputs"]["figures"] = []

@@ -34,6 +34,8 @@ from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study
 from calstudy.verdicts.criterion import Verdict
 
+pytestmark = pytest.mark.chain
+
 QUIET = Console(quiet=True)
 FIGURES_FOLDER = Path(__file__).parents[2] / "figures"
 FIGURES = ["layout", "gains", "data", "wedge", "spherical"]

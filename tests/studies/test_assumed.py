@@ -125,6 +125,7 @@ def test_the_resolved_file_reads_back_the_same(folder):
     assert load(folder / "resolved.yaml") == experiment
 
 
+@pytest.mark.chain
 def test_a_file_of_the_assumed_visibilities_gives_the_same_gains(folder):
     assumed = {"sky.foregrounds.count": 60}
     task = sky_model.sky_model(graph_of(sky_based(folder, **assumed), folder))
@@ -144,6 +145,7 @@ def test_sky_based_gains_follow_a_flux_scale_as_its_square_root(folder):
     np.testing.assert_allclose(np.abs(wrong), np.abs(right) / np.sqrt(1.1), rtol=1e-4)
 
 
+@pytest.mark.chain
 def test_what_the_sky_model_lacks_is_left_over_far_above_the_eor(folder):
     """Without 300 of 5000 sources 7 % of the rms are missing; the EoR of these studies is at 1e-4 of it."""
 
@@ -220,6 +222,7 @@ def test_a_run_says_that_its_sky_model_is_perfect(folder):
     assert "perfect" in (run.folder / "tables" / "sky-model.csv").read_text()
 
 
+@pytest.mark.chain
 def test_a_run_says_how_its_antennas_are_built(folder):
     data = override(sky_based(folder), "instrument.as_built", {"positions": {"scatter": "2 cm"}})
     experiment = validate(data, folder)

@@ -31,6 +31,8 @@ from calstudy.studies.load import load_study
 from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, scoring_of
 from calstudy.studies.study import Budget, run_study
 
+pytestmark = pytest.mark.chain
+
 ROOT = Path(__file__).parents[2]
 # With the weights of the program of the challenge's page.
 SKYCAL = {"calibrator": "skycal", "weights": "flags"}

@@ -6,6 +6,7 @@ Chunks have patches of the sky and blocks of channels of their own, with their o
 from pathlib import Path
 
 import numpy as np
+import pytest
 from pyuvdata import UVData
 from tiny import tiny
 
@@ -15,6 +16,8 @@ from calstudy.products.simulation import eor, foregrounds
 from calstudy.run.execution import Workers, execute, schedule
 from calstudy.run.store import Store
 from calstudy.simulate.settings import Nodes
+
+pytestmark = pytest.mark.chain
 
 
 def visibilities(folder: Path, chunks: int, workers: int) -> list[np.ndarray]:

@@ -87,6 +87,7 @@ def test_members_share_every_product_that_they_can(collection):
     assert len(set(keys)) == len(keys) < len(first.tasks) + len(second.tasks)
 
 
+@pytest.mark.chain
 def test_every_member_gets_its_own_folder_and_the_collection_another(finished, collection):
     assert list(finished.parts) == ["hexagon", "redundant"]
     folders = {run.folder for run in finished.parts.values()} | {finished.folder}

@@ -21,6 +21,8 @@ from calstudy.regression.comparison import accept, compare_figures, read_referen
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
+pytestmark = pytest.mark.chain
+
 DRAWN = True
 
 # Each of the two integrations is solved once, and anew, in one piece.

@@ -32,6 +32,8 @@ from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
+pytestmark = pytest.mark.chain
+
 DRAWN = True
 
 ANTENNAS, TIMES, CHANNELS = 12, 4, 48

@@ -31,6 +31,8 @@ from calstudy.studies.show import describe_plan, show_plan, show_run
 from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
 
+pytestmark = pytest.mark.chain
+
 DRAWN = True
 
 EVERYTHING = {"draw": ["eor", "gains", "noise"], "count": 3}

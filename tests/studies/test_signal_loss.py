@@ -19,6 +19,8 @@ from calstudy.studies.kinds.sweep import Sweep, expand
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
+pytestmark = pytest.mark.chain
+
 DRAWN = True
 
 ANTENNAS = 7

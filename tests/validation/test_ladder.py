@@ -18,6 +18,8 @@ from calstudy.run.execution import Budget
 from calstudy.validation.ladder import Ladder, run_ladder
 from calstudy.verdicts.criterion import Verdict
 
+pytestmark = pytest.mark.chain
+
 STEPS = ["-1", "0.0", "0.1", "0.2", "1.0", "2.0", "2.1", "2.2", "2.3", "2.4", "3.0", "4.0", "4.1"]
 KNOWN_FAILURES = {"2.1 fitted"}
 """What fails, and why: experiments/validation/README.md."""
