@@ -48,7 +48,7 @@ def bin_expected(
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)
-    bins, used = _bins_outside(modes, limits, buffer)
+    bins, used = bins_outside(modes, limits, buffer)
     used &= known
     count = np.bincount(bins[used], minlength=limits.size - 1)
     total = np.bincount(bins[used], transfer[used], limits.size - 1)
@@ -84,7 +84,7 @@ def bin_response(
     it, (Nbls, Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
     """
     limits = np.asarray(edges, float)
-    bins, used = _bins_outside(modes, limits, buffer)
+    bins, used = bins_outside(modes, limits, buffer)
     first, second = responses
     left, crossed, put_in = (
         np.bincount(bins[used], np.real(one.conj() * other)[used], limits.size - 1)
@@ -94,7 +94,7 @@ def bin_response(
     return left / put_in, crossed / put_in
 
 
-def _bins_outside(modes: BaselineModes, limits: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
+def bins_outside(modes: BaselineModes, limits: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the bin of |k| of each mode, and a mask of the modes that are in a bin and outside the wedge."""
     bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
     return bins, outside_wedge(modes, buffer) & (bins >= 0) & (bins < limits.size - 1)

@@ -16,6 +16,7 @@ from calstudy.power.gain_bias import GainBias
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.power.transfer import TransferFunction, TransferMap
+from calstudy.power.windows import UnbiasedSpectrum
 
 Spectrum = TypeVar(
     "Spectrum",
@@ -27,6 +28,7 @@ Spectrum = TypeVar(
     ExpectedBins,
     GainBias,
     Score,
+    UnbiasedSpectrum,
 )
 
 CSV_COLUMNS = {

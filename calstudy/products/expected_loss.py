@@ -11,7 +11,7 @@ from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
 from calstudy.calibrate.settings import GainFit
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.settings import PowerSettings
@@ -56,7 +56,17 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 def expected_loss(graph: Graph) -> Task:
     """Return the task that predicts T for the middle integration."""
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
-    return ExpectedLoss(LABEL, probes=PROBES, power=power, **_solved(graph))
+    return ExpectedLoss(LABEL, probes=PROBES, power=power, **solved_inputs(graph))
+
+
+def why_no_response(experiment: Experiment) -> str | None:
+    """Return why the linear response of a fit cannot be compared with its spectra, to follow "needs", or None."""
+    fit, size = experiment.calibration, size_of_instrument(experiment.instrument)
+    if not isinstance(fit, GainFit) or fit.integrations_per_solve > 1 or fit.smooth_gains is not None:
+        return "a fit of each integration by least squares, without smooth_gains"
+    if size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES:
+        return f"at most {LARGEST:g} times the visibilities of the paper's array"
+    return "power.pairs: same-baseline" if experiment.power.pairs == "redundant-group" else None
 
 
 @memoize
@@ -66,27 +76,24 @@ def linear_response(graph: Graph) -> Task | None:
     Calibrators must fit each integration by least squares and use the gains without smoothing. Spectra must be of each
     baseline with itself, because a fit responds differently on different baselines of a group. Large arrays have none.
     """
-    fit, power = graph.experiment.calibration, graph.experiment.power
-    fits = isinstance(fit, GainFit) and fit.integrations_per_solve == 1 and fit.smooth_gains is None
-    size = size_of_instrument(graph.experiment.instrument)
-    large = size.baselines * size.channels.count > LARGEST * PAPER_SAMPLES
-    if not fits or large or power.pairs == "redundant-group":
+    if why_no_response(graph.experiment):
         return None
-    power = power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin")
+    power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT, "bins", "length_bin")
     even, odd = (
         Response(
             f"response to the EoR to first order, {parity}",
             power=power.with_defaults("wedge_buffer"),
             signal=corruption.data(graph, Variant(components=("eor",)), "even"),
             temporary=True,
-            **_solved(graph, parity),
+            **solved_inputs(graph, parity),
         )
         for parity in corruption.PARITIES
     )
     return LinearResponse("linear response to the EoR", power=power, even=even, odd=odd)
 
 
-def _solved(graph: Graph, parity: str = "even") -> dict[str, Any]:
+def solved_inputs(graph: Graph, parity: str = "even") -> dict[str, Any]:
+    """Return the fields of a `Solved` for the middle integration of one realization of the residual."""
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
     return {
         **calibration.calibration_inputs(graph, residual, parity),
@@ -98,17 +105,27 @@ def _solved(graph: Graph, parity: str = "even") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Solution:
-    """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs), pairs (Nbls, 2)."""
+    """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs), pairs (Nbls, 2).
+
+    `vectors` are those of the baselines, m, (Nbls, 3).
+    """
 
     problem: CalibrationProblem
     gains: np.ndarray
     model: np.ndarray
     pairs: np.ndarray
-    lengths: np.ndarray
+    vectors: np.ndarray
     frequency: np.ndarray
 
+    @property
+    def lengths(self) -> np.ndarray:
+        """Lengths of the baselines, m, (Nbls,)."""
+        import numpy as np
 
-class _Solved(Calibrated):
+        return np.linalg.norm(self.vectors, axis=1)
+
+
+class Solved(Calibrated):
     """A calibrated integration of simulated data."""
 
     calibration: Input
@@ -144,7 +161,7 @@ class _Solved(Calibrated):
             gains,
             to_cube(model)[0, ..., 0],
             antenna_pairs(model),
-            prepared.data.lengths,
+            prepared.data.vectors,
             np.asarray(data.freq_array, float),
         )
 
@@ -154,7 +171,7 @@ class _Solved(Calibrated):
         return integration_times(self.data / DATA)[[self.integration]]
 
 
-class ExpectedLoss(_Solved, stage="expected-loss", version=4):
+class ExpectedLoss(Solved, stage="expected-loss", version=4):
     """The expected T of one calibrated integration."""
 
     probes: int
@@ -178,10 +195,10 @@ class ExpectedLoss(_Solved, stage="expected-loss", version=4):
         return {"integration": self.integration, "probes": self.probes}
 
     def _cost(self) -> Cost:
-        return _cost_of(self, self.probes, 1.5e9)
+        return cost_of_responses(self, self.probes, 1.5e9)
 
 
-class Response(_Solved, stage="response", version=1):
+class Response(Solved, stage="response", version=1):
     """The linear response of one calibrated integration to a signal."""
 
     signal: Input
@@ -210,10 +227,10 @@ class Response(_Solved, stage="response", version=1):
         return {}
 
     def _cost(self) -> Cost:
-        return _cost_of(self, 1, 2.5e9)
+        return cost_of_responses(self, 1, 2.5e9)
 
 
-def _cost_of(task: _Solved, responses: int, memory: float) -> Cost:
+def cost_of_responses(task: Solved, responses: int, memory: float) -> Cost:
     """Return the cost of some linear responses, with the bytes of memory for the paper's array."""
     size = size_of(task)
     work = size.baselines * size.channels.count / PAPER_SAMPLES
@@ -240,7 +257,7 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
             if not even.files or not odd.files:
                 write_json(output / RESPONSE, {"bands": None})
                 return {}
-            where = _modes(even["delay"], even["lengths"], float(even["centre"]), self.power)
+            where = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
             answers = even["left"], odd["left"]
             transfer, cross = bin_response(where, even["signal"], answers, BANDS, self.power.wedge_buffer)
         bands = [
@@ -251,7 +268,7 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
         return {}
 
 
-def _modes(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
+def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
     """Return the modes of baselines (lengths in m) at delays (s), for the centre of the band (Hz)."""
     from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
     from calstudy.power.spectra import BaselineModes
@@ -269,6 +286,6 @@ def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power
     """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
     from calstudy.power.binned import make_bin_edges
 
-    modes = _modes(expected.delay, lengths, centre, power)
+    modes = modes_of(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)
     return bin_expected(modes, expected.transfer, expected.error, edges, power.wedge_buffer, power.length_bin)

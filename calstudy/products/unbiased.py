@@ -1,0 +1,132 @@
+"""The spectrum of a calibrated signal without its loss, by the linear response of the fit to each bin of k."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from calstudy.base.errors import InputError
+from calstudy.base.resources import Cost
+from calstudy.power.settings import PowerSettings
+from calstudy.products import corruption, signal_loss
+from calstudy.products.expected_loss import (
+    AMPLITUDES,
+    NOT_OF_THE_FIT,
+    Solved,
+    cost_of_responses,
+    modes_of,
+    solved_inputs,
+)
+from calstudy.products.files import read_json, spectrum_file
+from calstudy.products.graph import Graph, memoize, required
+from calstudy.products.signal_loss import SCALE
+from calstudy.products.spectra import spectra
+from calstudy.run.task import Input, Task
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+UNBIASED = "unbiased.h5"
+FURTHEST = 0.6
+"""Last k, h/Mpc, with a window function: from there on T does not change."""
+DRAWS, SEED = 4, 20_211_021
+"""Random signals of each bin, and their seed."""
+REDUNDANT = 1.0
+"""Baselines whose vectors agree to this, m, see the same signal."""
+
+
+@memoize
+def unbiased(graph: Graph) -> Task:
+    """Return the task of the spectrum without its loss, of an experiment for which `why_no_response` is None."""
+    power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
+    even, odd = (
+        BinResponse(f"response to each bin of k, {parity}", power=power, temporary=True, **solved_inputs(graph, parity))
+        for parity in corruption.PARITIES
+    )
+    scale = required(signal_loss.transfer(graph)).scale
+    return Unbiased("spectrum without loss", power=power, even=even, odd=odd, spectra=spectra(graph), scale=scale)
+
+
+class BinResponse(Solved, stage="bin-response", version=1):
+    """The linear response of one calibrated integration to random signals of each bin of k."""
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the amplitudes of what is left of the signals; none if there are no gains."""
+        import numpy as np
+
+        from calstudy.calibrate.expected_loss import DelayModes
+        from calstudy.calibrate.expected_loss import linear_response as response_to
+        from calstudy.instrument.layouts import redundant_groups
+        from calstudy.power.windows import BinSignals
+
+        solution, arrays = self.solution(), {}
+        if solution is not None:
+            groups = redundant_groups(solution.vectors, REDUNDANT)
+            where = solution.frequency, solution.lengths, groups.index, groups.conjugated
+            signals = BinSignals(*where, window_edges(self.power), self.power.cosmology)
+            modes, rng = DelayModes(solution.frequency, self.power.taper), np.random.default_rng(SEED)
+            fit = solution.problem, solution.gains, solution.model
+            left = [[modes.amplitudes(response_to(*fit, signal)) for signal in signals.draw(rng)] for _ in range(DRAWS)]
+            arrays = {
+                "left": np.array(left, np.complex64),
+                "delay": modes.delay,
+                "lengths": solution.lengths,
+                "centre": solution.frequency.mean(),
+                "norm": np.sum(modes.weights**2),
+            }
+        np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
+        return {}
+
+    def _cost(self) -> Cost:
+        return cost_of_responses(self, DRAWS * len(window_edges(self.power)), 2.5e9)
+
+
+class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
+    """The spectrum of the residual without its loss, by the window functions of one integration."""
+
+    power: PowerSettings
+    even: Input
+    odd: Input
+    spectra: Input
+    scale: Input
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the spectrum with its window functions; raises InputError if the integration has no gains."""
+        import numpy as np
+
+        from calstudy.power.spectra import SphericalSpectrum
+        from calstudy.power.tables import load_spectrum, save_spectrum
+        from calstudy.power.windows import UnbiasedSpectrum, deconvolved, window_matrix
+
+        edges = window_edges(self.power)
+        with (
+            np.load(self.even / AMPLITUDES, allow_pickle=False) as even,
+            np.load(self.odd / AMPLITUDES, allow_pickle=False) as odd,
+        ):
+            if not even.files or not odd.files:
+                raise InputError("unbiased: the middle integration has antennas or channels without gains")
+            modes = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
+            both = even["left"], odd["left"]
+            window = window_matrix(modes, both, float(even["norm"]), edges, self.power.wedge_buffer)
+        residual, signal = (
+            load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
+            for name in ("residual", "eor")
+        )
+        known = read_json(self.scale / SCALE)["flux_scale"]
+        squared, bins = 1 if known is None else known**2, slice(edges.size - 1)
+        measured, error = squared * residual.power.real[bins], squared * residual.error[bins]
+        power, its_error = deconvolved(window, measured, error)
+        k = (edges[1:] + edges[:-1]) / 2
+        found = UnbiasedSpectrum(k, edges, window, measured, error, power, its_error, signal.power.real[bins])
+        save_spectrum(output / UNBIASED, found)
+        return {}
+
+
+def window_edges(power: PowerSettings) -> np.ndarray:
+    """Return the edges of the bins of k that have window functions, h/Mpc."""
+    from calstudy.power.binned import make_bin_edges
+
+    edges = make_bin_edges(power.bins)
+    return edges[: max(int(edges.searchsorted(FURTHEST, side="right")), 2)]
