@@ -442,7 +442,8 @@ def test_the_program_of_the_challenge_page_finds_the_gains_of_skycal(exported, s
     """Two programs minimize the same function; the phase of all antennas together is free in every channel."""
     folder = tmp_path / "copy"
     shutil.copytree(exported, folder)
-    [code] = re.findall(r"```python\n(# calibrate.py.*?)```", (ROOT / "docs" / "challenge.md").read_text(), re.DOTALL)
+    page = (ROOT / "docs" / "challenge" / "README.md").read_text()
+    [code] = re.findall(r"```python\n(# calibrate.py.*?)```", page, re.DOTALL)
     (tmp_path / "calibrate.py").write_text(code)
     subprocess.run([sys.executable, tmp_path / "calibrate.py", folder], check=True)
     for name in NAMES:

@@ -78,7 +78,7 @@ def test_a_step_that_cannot_be_measured_fails_alone(monkeypatch, capsys):
 
 
 def test_the_step_of_the_page_can_be_measured():
-    page = (Path(__file__).parents[2] / "docs" / "validation.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text()
     name, text = re.search(r"```python\n# (\S+)\n(.*?)```", page, re.DOTALL).groups()
     Path(name).write_text(text)
     ladder = load_ladder([name], "small")
