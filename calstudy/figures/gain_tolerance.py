@@ -225,6 +225,11 @@ class GainTolerance(StudyFigure):
     )
     sections = ("corruption.eor_level",)
 
+    def captioned(self) -> str:
+        """Return the caption with the sources and reasons of the published tolerances."""
+        lines = [f"{line.name} ({line.source}): {line.reason}" for line in self.published]
+        return f"{self.caption} Dotted lines: {'; '.join(lines)}." if lines else self.caption
+
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the scores of one case and its law; raises InputError if the law is not of its effects."""
         return {"": required(score(graph)), "law": gain_bias(graph)}
@@ -237,7 +242,4 @@ class GainTolerance(StudyFigure):
             bands = found[first].bands
             law = read_gain_bias(job.inputs[f"law:{case_name(row, 0)}"])
             worlds[world] = tolerated(law, bands.bias, bands.bias_error)
-        figure = draw_gain_tolerance(worlds, job.settings.get("eor_level"), self.published)
-        sources = "; ".join(f"{line.name} ({line.source}): {line.reason}" for line in self.published)
-        notes = {"caption": f"{self.caption} Dotted lines: {sources}."} if sources else {}
-        return Drawing(figure, worlds, notes)
+        return Drawing(draw_gain_tolerance(worlds, job.settings.get("eor_level"), self.published), worlds)

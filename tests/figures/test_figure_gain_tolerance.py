@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from calstudy.figures.gain_tolerance import PublishedTolerance, draw_gain_tolerance, tolerated
+from calstudy.experiment.model import FIGURES
+from calstudy.figures.gain_tolerance import GainTolerance, PublishedTolerance, draw_gain_tolerance, tolerated
 from calstudy.power.gain_bias import GainBias
 from calstudy.power.score import BANDS
 
@@ -99,3 +100,10 @@ def test_published_tolerances_are_lines_with_names_beside_the_panel_that_do_not_
 def test_a_published_tolerance_says_what_it_needs(changes, sentence):
     with pytest.raises(ValidationError, match=sentence):
         published(**changes)
+
+
+def test_the_caption_has_the_sources_and_reasons():
+    plain = FIGURES.make("gain-tolerance")
+    given = GainTolerance(published=(published(),))
+    assert plain.captioned() == plain.caption
+    assert given.captioned() == plain.caption + " Dotted lines: A (a thesis): the EoR."
