@@ -152,8 +152,10 @@ def gain_errors(
     if absorbed is not None:
         variances = known * absorbed.variances
     elif not problem.frozen:
-        invert = as_a_whole if unknowns <= MOST_UNKNOWNS else by_antenna
-        variances = invert(tangent, structure.antennas, alignment, spans)
+        if unknowns <= MOST_UNKNOWNS:
+            variances = as_a_whole(tangent, structure.antennas, alignment, spans)
+        else:
+            variances = by_antenna(tangent, structure.antennas, alignment, spans, known)
     residual = problem.visibilities - gain_products(gains, structure.antennas) * model
     powers = np.sum(problem.weights * np.abs(residual) ** 2, axis=0)
     loss, powers = float(np.sum(powers)), powers[has_data.any(axis=0)]
