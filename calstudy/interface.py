@@ -102,6 +102,7 @@ def calibrate_data(
     observed: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     quiet: bool = False,
+    gain_errors: bool = True,
     **changes: Any,
 ) -> CalibratedData:
     """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
@@ -118,6 +119,8 @@ def calibrate_data(
         Whether results of an earlier calibration may be replaced.
     quiet
         If true, no progress is printed.
+    gain_errors
+        Whether gains get their errors by noise, as without ``--no-gain-errors``.
     **changes
         Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
 
@@ -129,7 +132,8 @@ def calibrate_data(
     from rich.console import Console
 
     paths = [data] if isinstance(data, str | Path) else data
-    sections = {"observed": {"data": [str(path) for path in paths], **(observed or {})}}
+    section = {"data": [str(path) for path in paths], **(observed or {})}
+    sections = {"observed": section, "gain_errors": gain_errors}
     folder = Path(output)
     require_free(folder, overwrite)
     with quiet_libraries():

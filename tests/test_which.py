@@ -78,6 +78,15 @@ def test_faults_are_in_the_words_of_the_options_and_said_once(positions, capsys,
     assert "other cases" not in written
 
 
+@pytest.mark.parametrize(
+    "options", [("{kind: csv, path: mine.csv}",), ("hex", "--set", "instrument.layout={kind: csv, path: mine.csv}")]
+)
+def test_paths_in_blocks_and_in_set_start_at_the_working_directory(positions, capsys, options):
+    status, written = run_and_read(capsys, "which", *options, "--site", "hera", "--beam", "airy", "--dry-run")
+    assert status == 0, written.err
+    assert "\n6 antennas" in written.out
+
+
 def test_an_array_without_redundancy_loses_the_calibrator_that_needs_it():
     study = load_study(Path("which"), None, array_changes("golomb", None, None))
     refused = {study.title(label).partition(" in ")[0] for label in study.refusals}

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from calstudy.base.plugins import Plugin
-from calstudy.base.schema import defaults
+from calstudy.base.schema import REVISED, defaults
 from calstudy.base.user_code import digest_file
 
 
@@ -17,7 +17,8 @@ def identity(value: Any) -> Any:
     """Return settings as JSON that is the same for settings that give the same result.
 
     Fields of sections are omitted if they have their default, so that a new field does not change the keys of
-    earlier products; a change of a default requires a new version of the stages that read it. The tag of a
+    earlier products; a change of a default requires a new version of the stages that read it. A field may have a
+    version of its own (`calstudy.base.schema.REVISED`), where only its other values give new results. The tag of a
     choice between blocks is always present unless it is the default choice. An input file is identified by its
     content, a folder by the names and contents of its files, and a plug-in by the content of its file or
     the version of its package.
@@ -39,7 +40,7 @@ def _identity_of_folder(folder: Path) -> dict[str, str]:
 
 
 def _identity_of_section(section: BaseModel) -> dict[str, Any]:
-    found = {}
+    found: dict[str, Any] = {}
     fields = type(section).model_fields
     for name, default in defaults(type(section)).items():
         value, extra = getattr(section, name), fields[name].json_schema_extra
@@ -51,5 +52,6 @@ def _identity_of_section(section: BaseModel) -> dict[str, Any]:
             content = identity(value)
             # A block with the identity of the default is left out as well.
             if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):
-                found[name] = content
+                version = extra.get(REVISED) if isinstance(extra, dict) else None
+                found[name] = content if version is None else {REVISED: version, "value": content}
     return found

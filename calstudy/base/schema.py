@@ -27,6 +27,8 @@ from calstudy.base.errors import InputError, nearest
 
 UNKEYED: JsonDict = {"keyed": False}
 """`json_schema_extra` of a field that affects how results are computed, but not their values (except for rounding)."""
+REVISED = "revised"
+"""Key of `json_schema_extra`: the version of the results of a field's values other than its default."""
 FOLDER: JsonDict = {"folder": True}
 """`json_schema_extra` of a path that is a folder of input files."""
 NESTED = "nested"

@@ -101,7 +101,9 @@ def fix_degeneracies(
     if problem.structure.gain_vectors is None:
         turned = fix_phase(gains, problem.initial_gains)
     else:
-        turned = fix_phase(gains.reshape(-1, 1), problem.initial_gains.reshape(-1, 1)).reshape(gains.shape)
+        # Gains without data are where they started.
+        reference = np.where(problem.antenna_weights > 0, problem.initial_gains, 0)
+        turned = fix_phase(gains.reshape(-1, 1), reference.reshape(-1, 1)).reshape(gains.shape)
     return turned / np.sqrt(scale), model * scale
 
 

@@ -144,7 +144,7 @@ def gain_errors(
         return "the fit has as many unknowns as data, and leaves no residual that tells the noise"
     free = not problem.frozen and not tangent.finite
     delay = ORDERS * max(bucket.half_width for bucket in structure.basis.buckets) if free else 0.0
-    spans = _spans(has_data, gain_vectors(frequencies, delay) if free else None)
+    spans = _spans(has_data, _smooth(frequencies, delay, has_data) if free else None)
     if not any(span.size for span in spans):
         return f"foregrounds can follow gains up to delays of {delay * 1e9:.0f} ns, and the channels resolve no others"
     unknowns = 2 * sum(span.shape[1] for span in spans)
@@ -152,8 +152,10 @@ def gain_errors(
     if absorbed is not None:
         variances = known * absorbed.variances
     elif not problem.frozen:
-        invert = as_a_whole if unknowns <= MOST_UNKNOWNS else by_antenna
-        variances = invert(tangent, structure.antennas, alignment, spans)
+        if unknowns <= MOST_UNKNOWNS:
+            variances = as_a_whole(tangent, structure.antennas, alignment, spans)
+        else:
+            variances = by_antenna(tangent, structure.antennas, alignment, spans, known)
     residual = problem.visibilities - gain_products(gains, structure.antennas) * model
     powers = np.sum(problem.weights * np.abs(residual) ** 2, axis=0)
     loss, powers = float(np.sum(powers)), powers[has_data.any(axis=0)]
@@ -226,6 +228,12 @@ class ErrorsInTime:
             if not np.allclose([*problem.deviations, levels[0]], [*last.deviations, levels[1]], SIMILAR, atol=0):
                 return None
         return last.absorbed
+
+
+def _smooth(frequencies: np.ndarray, delay: float, has_data: np.ndarray) -> np.ndarray:
+    """Return the sequences up to a delay, (Nfreqs, Nsmooth), in the band that foregrounds are modelled in."""
+    channels = np.flatnonzero(has_data.any(axis=0))
+    return gain_vectors(frequencies, delay, slice(int(channels[0]), int(channels[-1]) + 1))
 
 
 def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:

@@ -102,9 +102,12 @@ def as_a_whole(
 
 
 def by_antenna(
-    tangent: TangentSpace, antennas: np.ndarray, alignment: Alignment, spans: list[np.ndarray]
+    tangent: TangentSpace, antennas: np.ndarray, alignment: Alignment, spans: list[np.ndarray], known: np.ndarray
 ) -> np.ndarray:
-    """Return the diagonal of H^-1 within the spans, from the blocks of antennas and the coupling in channels."""
+    """Return the diagonal of H^-1 within the spans, from the blocks of antennas and the coupling in channels.
+
+    `known` is the diagonal for known foregrounds, of `by_channel`.
+    """
     shape = alignment.of_channel.shape
     degrees, alone, with_scale = np.zeros(shape), np.zeros((2, *shape)), np.zeros(shape)
     for ends in antennas.T:
@@ -119,7 +122,7 @@ def by_antenna(
                 with_scale[antenna] = real.T @ (real @ alignment.of_all[antenna])
     uncoupled = np.divide(1, degrees, out=np.zeros(shape), where=degrees > 0)
     uncoupled = np.stack([uncoupled, alignment.independent(uncoupled)])
-    found = by_channel(tangent, antennas, alignment) * np.stack([alone[0], alignment.independent(alone[1])])
+    found = known * np.stack([alone[0], alignment.independent(alone[1])])
     found = np.divide(found, uncoupled, out=np.zeros(found.shape), where=uncoupled > 0)
     if alignment.of_all is not None:
         found[0] += np.sum(alignment.of_all * with_scale) - 2 * with_scale

@@ -64,11 +64,11 @@ class PreparedFit:
     def structure_between(self, first: int, end: int, settings: GainFit) -> FitStructure:
         """Return the structure of an integration with data in channels `first` to `end` - 1.
 
-        It is that of all channels where foregrounds are not free: a finite prior is the same in a part of the band.
-        Raises InputError as `make_structure`.
+        It is that of all channels where neither foregrounds are free nor gains restricted. Raises InputError as
+        `make_structure`.
         """
         free = isinstance(settings, ForegroundFit) and not settings.frozen and not settings.foreground_prior.finite
-        if not free or (first, end) == (0, self.structure.n_frequencies):
+        if not (free or settings.gain_delay is not None) or (first, end) == (0, self.structure.n_frequencies):
             return self.structure
         if (first, end) not in self._of_bands:
             self._of_bands[first, end] = make_structure(self.data, settings, slice(first, end))
@@ -130,8 +130,8 @@ def problem_at(
 def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:
     """Return the problem of some consecutive integrations together, or the reason why there is none.
 
-    Weights that come from the gains are those of unity gains. Free foregrounds are modelled from the first channel with
-    data to the last.
+    Weights that come from the gains are those of unity gains. Free foregrounds and restricted gains have sequences from
+    the first channel with data to the last.
     """
 
     def rows(cube: np.ndarray) -> np.ndarray:

@@ -302,16 +302,18 @@ def gain_products(gains: np.ndarray, antennas: np.ndarray) -> np.ndarray:
 def make_structure(frame: Frame, settings: GainFit, band: slice = WHOLE_BAND) -> FitStructure:
     """Return the structure of the fit of one integration; its antennas are those of the frame.
 
-    A redundant group is modelled with the basis of its longest baseline. Raises InputError if the basis does not fit
-    into the channels of the band (see `calstudy.calibrate.basis.make_basis`).
+    A redundant group is modelled with the basis of its longest baseline. The band has the data: free foregrounds are
+    modelled in it, and restricted gains are smooth in it. Raises InputError if the basis does not fit into the channels
+    of the band (see `calstudy.calibrate.basis.make_basis`).
     """
     if isinstance(settings, ForegroundFit) and not settings.frozen:
-        structure = _foregrounds(frame, settings, band)
+        # A finite prior is the same in a part of the band.
+        structure = _foregrounds(frame, settings, WHOLE_BAND if settings.foreground_prior.finite else band)
     else:
         basis = _no_basis(frame.n_baselines, frame.n_channels)
         structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
     if settings.gain_delay is not None:
-        vectors = gain_vectors(frame.frequencies, settings.gain_delay)
+        vectors = gain_vectors(frame.frequencies, settings.gain_delay, band)
         structure = replace(structure, gain_vectors=vectors)
     return replace(structure, models_at_once=settings.models_at_once)
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
-from calstudy.base.schema import UNKEYED, Section, choice, fault
+from calstudy.base.schema import REVISED, UNKEYED, Section, choice, fault
 from calstudy.base.units import Delay, FluxDensity, Length
 from calstudy.calibrate.interface import Calibrator
 
@@ -314,7 +314,11 @@ class GainFit(WeightedFit):
     initial_gains: InitialGains = UnityStart()
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     gain_delay: Delay | None = Field(
-        None, gt=0, description="Restrict gains to a DPSS basis up to this delay; null: any gain in any channel."
+        None,
+        gt=0,
+        description="Restrict gains to a DPSS basis up to this delay; null: any gain in any channel.",
+        # Sequences are those of the band between flagged edges since 2.
+        json_schema_extra={REVISED: 2},
     )
     autos: bool = Field(False, description="Include autocorrelations in the fit.")
     models_at_once: int = Field(

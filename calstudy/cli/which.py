@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -63,15 +64,18 @@ def which(
     calibrators and worlds can be changed.
     """
     from calstudy.base.package_files import published
+    from calstudy.experiment.files import StudyFile
     from calstudy.run.execution import Budget
-    from calstudy.studies.load import load_study
+    from calstudy.studies.load import study_of
     from calstudy.studies.show import describe_plan, show_plan, show_run
     from calstudy.studies.study import run_study
 
     changes = [*array_changes(layout, site, beam), *(overrides or ())]
     console, budget = Console(soft_wrap=True, highlight=False), Budget(workers, max_memory)
     with named_as_options(_in_options):
-        study = load_study(published("experiments") / "which.yaml", scale, changes)
+        # The file is not the user's, and names no others: paths are those of options.
+        file = StudyFile.open(published("experiments") / "which.yaml", scale, changes)
+        study = study_of(replace(file, base=Path.cwd()))
     if dry_run:
         show_plan(describe_plan(study, budget), console)
         return

@@ -166,12 +166,16 @@ def validate(data: Mapping[str, Any], base: Path) -> Experiment:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """The content of a file, and the scale and the ``path=value`` overrides of the command line, not yet applied."""
+    """The content of a file, and the scale and the ``path=value`` overrides of the command line, not yet applied.
+
+    Relative paths start at the folder of the file, or at `base` if it is given.
+    """
 
     path: Path
     content: Mapping[str, Any]
     scale: str | None = None
     overrides: Sequence[str] = ()
+    base: Path | None = None
 
     @classmethod
     def open(cls, path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> StudyFile:
@@ -182,7 +186,7 @@ class StudyFile:
     @property
     def folder(self) -> Path:
         """The folder where relative paths start."""
-        return self.path.resolve().parent
+        return self.base or self.path.resolve().parent
 
     def changed(self) -> dict[str, Any]:
         """Return the content with scale and overrides applied; raises InputError if one cannot be applied."""

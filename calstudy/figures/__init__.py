@@ -124,6 +124,10 @@ class StudyFigure(Plugin):
             return "needs a calibrator that fits by least squares, such as calamity"
         return None
 
+    def captioned(self) -> str:
+        """Return the caption, with what the fields of the figure add to it: by default nothing."""
+        return self.caption
+
     def roles(self, played: Collection[str]) -> Sequence[str]:
         """Return the roles that the figure compares, given those played by members: by default all of `titles`."""
         del played
@@ -266,7 +270,7 @@ class Draw(Task, stage="figure", version=4):
         except ValueError as error:
             raise InputError(f"figure {self.figure.label!r}: {error}") from None
         save_figure(drawing.figure, arrays, output, self.figure.label)
-        return {"caption": self.figure.caption, **drawing.notes}
+        return {"caption": self.figure.captioned(), **drawing.notes}
 
 
 def figure_task(

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from calstudy.base.constants import SIGMAS_95
+from calstudy.base.schema import Section
+from calstudy.base.units import Fraction
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.comparison import COLOURS, MARKERS
 from calstudy.plotting import style
@@ -33,21 +36,26 @@ WHITE = 0.4
 """Where errors without correlation are drawn, over the shortest correlation length of the law."""
 
 
-class Published(NamedTuple):
-    """A published tolerance, in %, and where it was read."""
-
-    percent: float
-    source: str
+APART = 0.035
+"""Least distance of two names of published tolerances, over the height of a panel."""
 
 
-PUBLISHED = (
-    Published(0.001, "Tripathi et al. 2025"),
-    Published(0.01, "Mazumder et al. 2022"),
-    Published(0.1, "Mdlalose 2018"),
-    Published(0.5, "Trott & Wayth 2016"),
-    Published(1.0, "Beohar et al. 2026"),
-)
-"""Tolerances of gains from abstracts, of which the second is quoted by Beohar et al., and the third from others."""
+def _not_empty(text: str) -> str:
+    if not text.strip():
+        raise ValueError("is empty, and a published tolerance needs name, rms, source and reason")
+    return text
+
+
+Words = Annotated[str, AfterValidator(_not_empty)]
+
+
+class PublishedTolerance(Section):
+    """A published tolerance, which is drawn as a dotted line."""
+
+    name: Words = Field(description="What the line is called.", examples=["Tripathi et al. 2025"])
+    rms: Fraction = Field(gt=0, lt=1, description="Tolerated error of gains.", examples=["0.001 %"])
+    source: Words = Field(description="Where it was read.", examples=["arXiv:2502.20962, abstract"])
+    reason: Words = Field(description="What it is needed for.", examples=["unbiased astrophysical parameters"])
 
 
 @dataclass(frozen=True)
@@ -83,12 +91,16 @@ def tolerated(law: GainBias, bias: np.ndarray, error: np.ndarray) -> Tolerated:
 
 
 @style.journal_style()
-def draw_gain_tolerance(worlds: Mapping[str, Tolerated], eor_level: float | None = None) -> Figure:
+def draw_gain_tolerance(
+    worlds: Mapping[str, Tolerated],
+    eor_level: float | None = None,
+    published: Sequence[PublishedTolerance] = (),
+) -> Figure:
     """Draw the tolerated rms against the correlation length, a panel for each band of k: points on lines of the law.
 
     Colours are correlation times, dashed lines an exponential correlation, open symbols errors that antennas have in
-    common in part, arrows lower limits. Dotted lines are published tolerances. `eor_level` is that of the EoR in dB,
-    None if not known.
+    common in part, arrows lower limits. Dotted lines are published tolerances, named on the right. `eor_level` is that
+    of the EoR in dB, None if not known.
     """
     from matplotlib.lines import Line2D
 
@@ -100,13 +112,13 @@ def draw_gain_tolerance(worlds: Mapping[str, Tolerated], eor_level: float | None
         for number, kind in enumerate(kinds):
             members = [found for found in worlds.values() if _kind(found.law) == kind]
             _draw_kind(axes, members, band, number)
-        for published in PUBLISHED:
-            axes.axhline(published.percent, color=style.GREY, linewidth=0.7, linestyle=":", zorder=0)
+        for line in published:
+            axes.axhline(100 * line.rms, color=style.GREY, linewidth=0.7, linestyle=":", zorder=0)
         _scale(axes, [found.law for found in worlds.values()])
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
-    _name_published(panels[-1])
+    _name(published, panels[-1])
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB"
-    panels[0].set_ylabel(f"rms for a bias of {LIMIT:g} (%){level}")
+    panels[0].set_ylabel(f"rms (%) for a bias of {LIMIT:g}{level}")
     handles = [Line2D([], [], **_look(kind, number), label=_title(kind)) for number, kind in enumerate(kinds)]
     figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 4))
     return figure
@@ -175,32 +187,48 @@ def _scale(axes: Axes, laws: Sequence[GainBias]) -> None:
     axes.set_xlabel("correlation length (MHz)")
 
 
-def _name_published(axes: Axes) -> None:
-    """Name the dotted lines on the left of a panel, the lowest from below."""
-    left, lowest = axes.get_xlim()[0], min(published.percent for published in PUBLISHED)
-    for published in PUBLISHED:
-        below = published.percent == lowest
-        axes.text(
-            1.15 * left,
-            published.percent * (0.93 if below else 1.05),
-            f"{published.source}: {published.percent:g} %",
+def _name(published: Sequence[PublishedTolerance], axes: Axes) -> None:
+    """Name the dotted lines on the right of a panel, from below; names that would overlap move up."""
+    lowest, highest = np.log10(axes.get_ylim())
+    above = -np.inf
+    for line in sorted(published, key=lambda line: line.rms):
+        at = (np.log10(100 * line.rms) - lowest) / (highest - lowest)
+        if not 0 <= at <= 1:
+            continue
+        above = max(at, above + APART)
+        axes.annotate(
+            f"{line.name}: {100 * line.rms:g} %",
+            (1, above),
+            (3, 0),
+            xycoords="axes fraction",
+            textcoords="offset points",
             size=style.NOTE_SIZE,
             color=style.GREY,
-            va="top" if below else "bottom",
+            va="center",
         )
 
 
 class GainTolerance(StudyFigure):
     """The rms of gain errors at which the bias is a tenth of the EoR, against their correlation in frequency."""
 
-    of = ("comparison",)
-
+    # Published tolerances are settings since 2.
+    version: ClassVar[int] = 2
     kind: str = "gain-tolerance"
+    published: Annotated[tuple[PublishedTolerance, ...], Field(strict=False)] = Field(
+        (), description="Tolerances to compare with, drawn as dotted lines."
+    )
+
+    of = ("comparison",)
     caption = (
         "The rms of the real part of gain errors at which their bias is a tenth of the EoR, if nothing is calibrated: "
-        "measured (points, 95 % bars; arrows: lower limits) and by the law (lines). Dotted: published tolerances."
+        "measured (points, 95 % bars; arrows: lower limits) and by the law (lines)."
     )
     sections = ("corruption.eor_level",)
+
+    def captioned(self) -> str:
+        """Return the caption with the sources and reasons of the published tolerances."""
+        lines = [f"{line.name} ({line.source}): {line.reason}" for line in self.published]
+        return f"{self.caption} Dotted lines: {'; '.join(lines)}." if lines else self.caption
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the scores of one case and its law; raises InputError if the law is not of its effects."""
@@ -214,4 +242,4 @@ class GainTolerance(StudyFigure):
             bands = found[first].bands
             law = read_gain_bias(job.inputs[f"law:{case_name(row, 0)}"])
             worlds[world] = tolerated(law, bands.bias, bands.bias_error)
-        return Drawing(draw_gain_tolerance(worlds, job.settings.get("eor_level")), worlds)
+        return Drawing(draw_gain_tolerance(worlds, job.settings.get("eor_level"), self.published), worlds)

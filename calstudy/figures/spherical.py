@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.plotting import style
+from calstudy.power.cosmology import redshift
+from calstudy.power.limits import WITHIN, Limits, limits_near, published_limits, read_limits
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
+    from calstudy.experiment.model import Experiment
     from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.products.graph import Graph
 
 
 @dataclass(frozen=True)
@@ -60,16 +67,21 @@ MARKINGS = {
 """Series in the order of drawing, the later over the earlier."""
 LEGEND_ORDER = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "noise")
 ZOOMED = ("residual", "residual_without_eor", "noise")
+PUBLISHED = "published"
+LIMIT_MARKERS = ("v", "1", "$\\downarrow$", "P", "X", "*")
 
 
 @style.journal_style()
-def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0) -> Figure:
+def draw_spherical(
+    columns: Sequence[SphericalColumn], zoom_k: float = 1.0, limits: Sequence[Limits] = (), z: float = math.nan
+) -> Figure:
     """Draw spherical power spectra: full range above, signal and residuals enlarged below.
 
     Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
     or two columns, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone (Fig.
-    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³; the lower row ends at `zoom_k`, h/Mpc. Raise ValueError for another
-    number of columns, a spectrum without any power, or a power without an error bar.
+    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³; the lower row ends at `zoom_k`, h/Mpc. Published limits are drawn
+    above only; `z` is the redshift of the spectra, which stands beside theirs. Raise ValueError for another number of
+    columns, a spectrum without any power, or a power without an error bar.
     """
     if len(columns) not in (1, 2):
         raise ValueError(f"a spherical figure has 1 or 2 columns, not {len(columns)}")
@@ -90,8 +102,18 @@ def draw_spherical(columns: Sequence[SphericalColumn], zoom_k: float = 1.0) -> F
         row[0].set(xscale="log", yscale="log", ylim=ylim, xlim=(first, end))
         row[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
-    _add_legend(figure, columns)
+    drawn = [_draw_limits(grid[0], found, number) for number, found in enumerate(limits)]
+    title = rf"spectra: $z = {z:.2f}$; limits: $P = 2\pi^2 \Delta^2 / k^3$" if drawn else None
+    _add_legend(figure, columns, drawn, title)
     return figure
+
+
+def _draw_limits(row: Sequence[Axes], limits: Limits, number: int) -> Line2D:
+    """Draw upper limits of P in several axes, and return the line of the last."""
+    marker, label = LIMIT_MARKERS[number % len(LIMIT_MARKERS)], f"{limits.name}, $z = {limits.redshift:g}$"
+    look: dict[str, Any] = {"color": style.GREY, "marker": marker, "markersize": 3.5, "linewidth": 0.6}
+    lines = [axes.plot(limits.k, limits.power, linestyle=":", label=label, zorder=1.5, **look)[0] for axes in row]
+    return lines[-1]
 
 
 def _check(column: SphericalColumn) -> None:
@@ -180,7 +202,9 @@ def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
     return 0.85 * float(first), 1.1 * float(last)
 
 
-def _add_legend(figure: Figure, columns: Sequence[SphericalColumn]) -> None:
+def _add_legend(
+    figure: Figure, columns: Sequence[SphericalColumn], limits: Sequence[Line2D], title: str | None
+) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -202,9 +226,23 @@ def _add_legend(figure: Figure, columns: Sequence[SphericalColumn]) -> None:
     handles.append(Line2D([], [], linestyle="none", **open_marker))
     labels.append(r"open: $P < 0$")
     spacing: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
-    figure.legend(handles, labels, loc="outside upper center", ncols=7 if len(columns) == 2 else 3, **spacing)
+    ncols = 7 if len(columns) == 2 else 3
+    if limits:
+        handles += limits
+        labels += [str(line.get_label()) for line in limits]
+        # Their names are long.
+        ncols = 5 if len(columns) == 2 else 2
+        spacing |= {"title": title, "title_fontsize": 7.0}
+    figure.legend(handles, labels, loc="outside upper center", ncols=ncols, **spacing)
 
 
+LimitsTable = Annotated[
+    Path,
+    Field(strict=False),
+    BeforeValidator(lambda value: published_limits() if value == PUBLISHED else value),
+    PlainSerializer(lambda path: PUBLISHED if path == published_limits() else str(path), str, when_used="json"),
+]
+"""A table of limits by its path, or by a word the one that comes with calstudy."""
 SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eor", "noise")
 """The variants that are shown if the experiment has them."""
 
@@ -218,15 +256,58 @@ def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
     return SphericalColumn(title=title, **series)
 
 
+def redshift_of(experiment: Experiment) -> float:
+    """Return the redshift of the middle of the band, as power spectra have it."""
+    return redshift(sum(experiment.instrument.channels.band) / 2)
+
+
 class Spherical(StudyFigure):
     """Spherical power spectra over all modes, and outside the wedge."""
 
     kind: str = "spherical"
+    limits: LimitsTable | None = Field(
+        None,
+        description="Upper limits to draw, the closest within 0.5 in redshift of each name: `published`, a table that "
+        "comes with calstudy, or a CSV of name, reference, z, k in h/Mpc, and delta2, the limit of Δ² in mK².",
+    )
 
     caption = "Spherical power spectra with 95 % bars; open where negative."
     variants = ("eor",)
     sections = ("power.wedge_buffer",)
     tolerances = SPHERICAL_RULES
+
+    def refusal(self, experiment: Experiment) -> str | None:
+        """Return why the figure cannot be drawn, such as that no limit is near the redshift."""
+        z = redshift_of(experiment)
+        if self.limits is not None and not self.limits_at(z):
+            return f"has limits, but none within {WITHIN:g} of the redshift of the data, {z:.2f}"
+        return super().refusal(experiment)
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return the edge of the wedge and, where there are limits, the redshift."""
+        found = super().settings(graph)
+        return found if self.limits is None else {**found, "redshift": redshift_of(graph.experiment)}
+
+    def limits_at(self, z: float) -> list[Limits]:
+        """Return the limits near a redshift."""
+        if self.limits is None:
+            return []
+        return limits_near(read_limits(self.limits), z)
+
+    def captioned(self) -> str:
+        """Return the caption with the sources of the limits."""
+        if self.limits is None:
+            return self.caption
+        sources = dict.fromkeys(f"{limits.name} ({limits.reference})" for limits in read_limits(self.limits))
+        return f"{self.caption} Dotted: upper limits near this redshift, of {'; '.join(sources)}."
+
+    def drawn(self, columns: Mapping[str, SphericalColumn], job: Job) -> Drawing:
+        """Draw the columns with the limits."""
+        z = job.settings.get("redshift", math.nan)
+        limits = self.limits_at(z)
+        figure = draw_spherical(list(columns.values()), limits=limits, z=z)
+        shown = {f"limits.{number}": found for number, found in enumerate(limits)}
+        return Drawing(figure, {**columns, **shown})
 
     def excised(self, job: Job) -> SphericalColumn:
         """Read the spectra over the modes outside the wedge."""
@@ -236,8 +317,7 @@ class Spherical(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Draw a column for each choice of modes."""
         everything = read_column(job.inputs["spectra"], "all modes", "all-modes")
-        columns = {"all_modes": everything, "excised": self.excised(job)}
-        return Drawing(draw_spherical(list(columns.values())), columns)
+        return self.drawn({"all_modes": everything, "excised": self.excised(job)}, job)
 
 
 class SphericalExcised(Spherical):
@@ -249,8 +329,7 @@ class SphericalExcised(Spherical):
 
     def draw(self, job: Job) -> Drawing:
         """Draw one column."""
-        column = self.excised(job)
-        return Drawing(draw_spherical([column]), {"excised": column})
+        return self.drawn({"excised": self.excised(job)}, job)
 
 
 def draw_spherical_comparison(

@@ -28,7 +28,7 @@ def gain_coverage(graph: Graph, variant: Variant, parity: str) -> Task:
     return MeasureCoverage(f"coverage {parity}", gains=true, **solved(graph, variant, parity))
 
 
-class MeasureCoverage(OfSolves, stage="gain-coverage", version=2):
+class MeasureCoverage(OfSolves, stage="gain-coverage", version=3):
     """Fractions of the gains of each solve that are within their errors of the true gains, unity if there are none."""
 
     gains: Input = None

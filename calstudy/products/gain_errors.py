@@ -135,7 +135,7 @@ class OfSolves(Calibrated):
         return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
-class ErrorsOfGains(OfSolves, stage="gain-errors", version=3):
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=4):
     """The gains of a calibration with their errors."""
 
     def make(self, output: Path) -> Mapping[str, Any]:

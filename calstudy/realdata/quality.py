@@ -196,8 +196,8 @@ def count_unknowns(problem: CalibrationProblem, settings: GainFit) -> float | No
         return None
     used = problem.weights > 0
     antennas = np.unique(structure.antennas[used.any(axis=1)]).size
-    vectors = structure.gain_vectors
-    per_antenna = int(used.any(axis=0).sum()) if vectors is None else vectors.shape[1]
+    channels, vectors = used.any(axis=0), structure.gain_vectors
+    per_antenna = np.count_nonzero(channels if vectors is None else vectors[channels].any(axis=0))
     coefficients = 0 if settings.frozen else structure.basis.n_coefficients
     return coefficients + (antennas - 0.5) * per_antenna
 

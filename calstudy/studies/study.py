@@ -271,7 +271,7 @@ class Study(ABC):
             "description": self.description,
             **({"setup": self.setup} if self.setup else {}),
             "stand_ins": list(self.stand_ins),
-            "captions": {task.label: task.settings["figure"].caption for task in self.figures},
+            "captions": {task.label: task.settings["figure"].captioned() for task in self.figures},
             **({"parts": places} if places else {}),
             **self.entries,
             "warnings": removed(self.recorded, made.products),

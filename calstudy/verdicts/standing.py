@@ -89,8 +89,21 @@ class InBand:
     @property
     def transfer(self) -> float:
         """The smallest T of all worlds where it is measured."""
-        known = [world.transfer for world in self.worlds if is_measured(world.transfer, world.transfer_error)]
-        return min(known, default=math.nan)
+        return min(self._measured, default=math.nan)
+
+    @property
+    def _measured(self) -> list[float]:
+        return [world.transfer for world in self.worlds if is_measured(world.transfer, world.transfer_error)]
+
+    @property
+    def kept(self) -> str:
+        """The smallest T, and in how many worlds T is measured if that is not in all."""
+        known, n_worlds = len(self._measured), len(self.worlds)
+        if not known:
+            return "T not measured"
+        return f"T ≥ {self.transfer:.2f}" + (
+            f" where measured, {known} of {n_worlds} worlds" if known < n_worlds else ""
+        )
 
     @property
     def decisive(self) -> list[InWorld]:
@@ -107,8 +120,7 @@ class InBand:
     @property
     def numbers(self) -> str:
         """The upper limit of the bias in all worlds, and the smallest T."""
-        known = "T not measured" if math.isnan(self.transfer) else f"T ≥ {self.transfer:.2f}"
-        return f"bias < {_short(self.upper_limit)}, {known}"
+        return f"bias < {_short(self.upper_limit)}, {self.kept}"
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -189,7 +201,7 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
     keeps = "keeps more" if passed else "keeps much"
-    parts += [f"{entry.calibrator} {keeps} (T ≥ {entry.transfer:.2f}), but {entry}" for entry in tempting[:NAMED]]
+    parts += [f"{entry.calibrator} {keeps} ({entry.kept}), but {entry}" for entry in tempting[:NAMED]]
     rest = len(failed) - len(tempting[:NAMED])
     return [*parts, f"{rest} of {len(entries)} fail"] if rest else parts
 

@@ -6,16 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hera_cal.skycal import estimate_SNAP_decoherence
 from test_calamity import make_uvdata
 from test_hera_cal_calibrators import sky_of
 from toy import FREQUENCIES, Toy, make_toy, scattered
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
-from calstudy.base.visibilities import flag_cube, to_cube
+from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+from calstudy.calibrate.boards import Boards
+from calstudy.calibrate.calibrators.least_squares import SkyBased
 from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, DpssSmoothing, Solve
+from calstudy.calibrate.problem import gain_products
+from calstudy.calibrate.settings import FlagWeights, GaussNewtonSettings
+from calstudy.corrupt.effects.decoherence import Decoherence
+from calstudy.corrupt.interface import apply_effect, draw_truth
 
 NOISE, CHANNELS = 1e-4, 16
 BOARDS = {"per_board": 3, "block": "6.4 MHz", "detection": 0.0}
@@ -91,6 +98,74 @@ def test_the_correction_leaves_within_boards_what_is_smooth_and_changes_nothing_
         for uvd in (plain.residual, corrected.residual)
     ]
     assert steps[1] < steps[0] / 20
+
+
+@pytest.fixture(scope="module", params=[1e-3, 0.05])
+def without_noise(toy, request):
+    """The toy without noise, its data with losses by the effect, and these losses, (Nboards, Nblocks)."""
+    quiet = replace(toy, noise=np.zeros(toy.noise.shape))
+    uvd = make_uvdata(quiet, n_times=1)
+    effect = Decoherence(loss=request.param, block="6.4 MHz", seed=3)
+    observation = Observation(uvd)
+    truth = draw_truth(effect, observation)
+    cube = np.array(quiet.visibilities[None, :, :, None])
+    return quiet, from_cube(uvd, apply_effect(effect, cube, observation, truth)), truth["p"]
+
+
+def test_without_noise_the_estimate_is_the_loss_as_far_as_gains_are_smooth(without_noise):
+    quiet, data, losses = without_noise
+    result = run_calibrator(Skycal(boards=Boards(**BOARDS)), data, sky_of(data, quiet.foregrounds))
+    found = to_cube(result.model)[0, :, ::CHANNELS, 0] / quiet.foregrounds[:, ::CHANNELS]
+    # hera_cal's estimator by itself, of the gains between boards as they must be.
+    blocks = np.arange(FREQUENCIES.size) // CHANNELS
+    gains = {(a, "Jee"): (quiet.gains[a] * (1 - losses[a // 3])[blocks])[None] for a in range(12)}
+    by_itself, _ = estimate_SNAP_decoherence(
+        gains,
+        {key: np.ones(gain.shape) for key, gain in gains.items()},
+        {a: a // 3 for a in range(12)},
+        FREQUENCIES,
+        nchans_per_block=CHANNELS,
+        gain_smoothing_scale=100e-9,
+        detection_sigma=0.0,
+        full_sigma=0.0,
+        band_split_freq=0.0,
+    )
+    kept = np.log(1 - losses)
+    relative_loss = kept - kept.max(axis=1, keepdims=True)
+    estimate = np.log(1 - np.concatenate([by_itself[board] for board in range(4)]))
+    # What logarithms of cubic gains of 10 % have beyond 100 ns, whatever the loss.
+    np.testing.assert_allclose(estimate, relative_loss, atol=2e-5)
+    first, second = quiet.antennas.T // 3
+    expected = np.where(within(quiet)[:, None], 0, relative_loss[first] + relative_loss[second])
+    np.testing.assert_allclose(np.log(found.real), expected, atol=4e-5)
+
+
+def test_without_noise_sky_based_calibration_leaves_what_another_fit_leaves(without_noise):
+    """The minimum over antennas' factors of the sky's weighted misfit, by Newton steps for each channel by itself."""
+    quiet, data, losses = without_noise
+    solver = GaussNewtonSettings(tolerance=1e-10, max_steps=50, precision="double")
+    result = run_calibrator(SkyBased(weights=FlagWeights(), solver=solver), data, sky_of(data, quiet.foregrounds))
+    calibrated = to_cube(data)[0, :, :, 0] / gain_products(result.gains.gain_array[:, :, 0, 0], quiet.antennas)
+    left = (to_cube(data)[0, :, :, 0] / quiet.visibilities).real
+    size = np.abs(quiet.visibilities)
+    ends = np.zeros((len(left), 12))
+    for column in quiet.antennas.T:
+        ends[np.arange(len(left)), column] = 1
+    expected = np.empty(left.shape)
+    for channel in range(FREQUENCIES.size):
+        logarithms = np.zeros(12)
+        for _ in range(8):
+            product = np.exp(ends @ logarithms)
+            step = np.linalg.lstsq(
+                ends * (size[:, channel] * product)[:, None], size[:, channel] * (left[:, channel] - product)
+            )
+            logarithms += step[0]
+        expected[:, channel] = left[:, channel] / np.exp(ends @ logarithms)
+    np.testing.assert_allclose(calibrated / quiet.foregrounds, expected, rtol=1e-7)
+    # Too large by 1 / (1 - p)^2 within boards, but for what the fit gives way.
+    excess = np.sqrt(np.mean((expected[within(quiet)] - 1) ** 2))
+    full = np.sqrt(np.mean(((1 - losses) ** -2 - 1) ** 2))
+    assert 0.5 * full < excess < full
 
 
 def test_gains_without_losses_stay_as_they_are(toy):

@@ -294,6 +294,13 @@ def test_python_calibrates_as_the_command_does(data, command, tmp_path, monkeypa
     assert "1 converged" in repr(found)
     with pytest.raises(InputError, match=r"output = again: holds gains\.calh5"):
         calstudy.calibrate_data(data, "again")
+    faster = calstudy.calibrate_data(
+        data, "faster", {"select": {"times": "0..0"}}, quiet=True, gain_errors=False, **basis
+    )
+    np.testing.assert_allclose(faster.gains.gain_array, expected.gain_array, rtol=1e-6)
+    assert all("gain_errors" not in record for record in faster.solution["records"])
+    with pytest.raises(InputError, match="has no errors of gains"):
+        _ = faster.gain_errors
     with pytest.raises(InputError, match=r"calibration\.bsis"):
         calstudy.calibrate_data(data, "other", **{"bsis.buffer": "50 ns"})
 

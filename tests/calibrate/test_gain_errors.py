@@ -20,7 +20,7 @@ from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
 from calstudy.calibrate.basis import gain_vectors, make_basis
 from calstudy.calibrate.degeneracy import fix_degeneracies
 from calstudy.calibrate.gain_errors import ErrorsInTime, gain_errors
-from calstudy.calibrate.problem import FitStructure, flag_weights, gain_products
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
@@ -221,6 +221,26 @@ def test_what_foregrounds_absorb_is_kept_for_a_fringe(prior):
     for integration, deviation in ((3, 1.0), (4, 2.0) if prior else (9, 1.0)):
         found, alone = pair_of(integration, deviation)
         assert np.array_equal(found.amplitude, alone.amplitude)
+
+
+def test_errors_between_flagged_edges_are_as_if_there_were_no_such_channels():
+    """Sequences of all channels, cut at the edges, are more: without these, errors are 11 % too small on average."""
+    toy, band = make_toy(HEX), slice(8, 56)
+    flags = np.ones(toy.foregrounds.shape, bool)
+    flags[:, band] = False
+
+    def errors_in(channels, modelled):
+        basis = make_basis(np.linalg.norm(toy.vectors, axis=1), FREQUENCIES[channels], BASIS, band=modelled)
+        structure = FitStructure.per_baseline(toy.antennas, len(toy.positions), basis)
+        gains, start = toy.gains[:, channels], np.ones(toy.gains.shape, complex)[:, channels]
+        weights = flag_weights(flags[:, channels])
+        problem = CalibrationProblem(structure, toy.visibilities[:, channels], weights, start)
+        return gain_errors(problem, gains, toy.foregrounds[:, channels], FREQUENCIES[channels])
+
+    flagged, inside = errors_in(slice(None), band), errors_in(band, slice(None))
+    assert flagged.smooth_fraction == inside.smooth_fraction
+    for name in ("amplitude", "phase"):
+        np.testing.assert_allclose(getattr(flagged, name)[:, band], getattr(inside, name), rtol=1e-9)
 
 
 def test_errors_of_a_prior_that_is_too_narrow_are_too_small():

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from calstudy.figures.gain_tolerance import draw_gain_tolerance, tolerated
+from calstudy.experiment.model import FIGURES
+from calstudy.figures.gain_tolerance import GainTolerance, PublishedTolerance, draw_gain_tolerance, tolerated
 from calstudy.power.gain_bias import GainBias
 from calstudy.power.score import BANDS
 
@@ -62,3 +64,46 @@ def test_points_of_the_measurement_stand_beside_the_lines_of_the_law():
     drawn = [line.get_ydata() for line in first.get_lines()]
     # In percent.
     assert any(np.allclose(line, 100 * worlds["1 MHz"].sigma[0]) for line in drawn if len(line) == 1)
+
+
+def published(name="A", rms="1 %", source="a thesis", reason="the EoR"):
+    return PublishedTolerance(name=name, rms=rms, source=source, reason=reason)
+
+
+def test_published_tolerances_are_lines_with_names_beside_the_panel_that_do_not_overlap():
+    worlds = {"1 MHz": tolerated(LAW, BIAS, np.array([20.0, 2.0, 0.04]))}
+    near = [published("B", 0.011), published(), published("beyond the axis", "1e-7 %")]
+    figure = draw_gain_tolerance(worlds, published=near)
+    assert all(
+        {1.0, 1.1} <= {round(float(line.get_ydata()[0]), 6) for line in axes.get_lines()} for axes in figure.axes
+    )
+    figure.draw_without_rendering()
+    last = figure.axes[-1]
+    lower, upper = (text.get_window_extent() for text in last.texts)
+    assert [text.get_text() for text in last.texts] == ["A: 1 %", "B: 1.1 %"]
+    assert lower.y1 <= upper.y0 + 0.5
+    assert min(lower.x0, upper.x0) > last.get_window_extent().x1
+    assert max(lower.x1, upper.x1) <= figure.bbox.x1
+    # Without any, there are none.
+    assert not draw_gain_tolerance(worlds).axes[-1].texts
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"rms": "120 %"}, "less than 1"),
+        ({"source": " "}, "is empty"),
+        ({"reason": ""}, "is empty"),
+        ({"rms": 0}, "greater"),
+    ],
+)
+def test_a_published_tolerance_says_what_it_needs(changes, sentence):
+    with pytest.raises(ValidationError, match=sentence):
+        published(**changes)
+
+
+def test_the_caption_has_the_sources_and_reasons():
+    plain = FIGURES.make("gain-tolerance")
+    given = GainTolerance(published=(published(),))
+    assert plain.captioned() == plain.caption
+    assert given.captioned() == plain.caption + " Dotted lines: A (a thesis): the EoR."

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.colors import same_color, to_rgba
 
 from calstudy.figures.spherical import MARKINGS, draw_spherical, draw_spherical_comparison
+from calstudy.power.limits import Limits
 
 CAPTION = {
     "uncorrupted": ("o", "#000000"),
@@ -130,3 +131,23 @@ def test_spectra_that_cannot_be_drawn_are_refused(columns):
     ):
         with pytest.raises(ValueError, match=message):
             draw_spherical(bad)
+
+
+def test_published_limits_are_drawn_as_power_above_with_their_redshifts(columns):
+    limits = [
+        Limits(name, "doi", z, np.array([0.2, 0.4]), np.array([1e3, 4e3])) for name, z in (("First", 6.5), ("B", 7.0))
+    ]
+    figure = draw_spherical(columns, limits=limits, z=6.77)
+    grid = np.array(figure.axes).reshape(2, 2)
+    for axes in grid[0]:
+        (line,) = (line for line in axes.get_lines() if line.get_label() == "First, $z = 6.5$")
+        # P = 2 pi^2 Delta^2 / k^3.
+        np.testing.assert_allclose(line.get_ydata(), 2 * np.pi**2 * np.array([1e3 / 0.008, 4e3 / 0.064]))
+    assert not any("First" in str(line.get_label()) for axes in grid[1] for line in axes.get_lines())
+    (legend,) = figure.legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert names[-2:] == ["First, $z = 6.5$", "B, $z = 7$"]
+    assert legend.get_title().get_text().startswith("spectra: $z = 6.77$")
+    (without,) = draw_spherical(columns).legends
+    assert [text.get_text() for text in without.get_texts()] == names[:-2]
+    assert not without.get_title().get_text()

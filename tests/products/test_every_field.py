@@ -67,6 +67,7 @@ OTHER: dict[str, list[Any]] = {
     "Inspection.baselines": [[[0, 1]]],
     "Convergence.steps": [[1, 2]],
     "Outputs.tables": [["spectra"]],
+    "Spherical.limits": ["published"],
 }
 """Other values of fields whose types do not tell any."""
 FOLLOWED = {**BASE, "calibration": {"weights": "flags"}, "outputs": {"figures": ["convergence"]}}

@@ -128,3 +128,18 @@ def test_a_transfer_is_measured_if_it_is_a_part_of_the_signal_and_well_known(tra
 def test_nothing_passes_whose_signal_loss_is_not_known():
     found = standing_of(case(0.0, 0.01, transfer=0.5, transfer_error=0.4))
     assert str(found) == "open in 1 of 1 worlds: bias < 0.02, T not measured; T is not measured there"
+
+
+def test_the_smallest_t_is_not_said_of_worlds_where_it_is_not_measured():
+    unknown = case(0.0, 0.01, transfer=0.3, transfer_error=0.4)
+    found = standing_of(case(0.0, 0.01, transfer=0.8), unknown)
+    told = "open in 1 of 2 worlds: bias < 0.02, T ≥ 0.80 where measured, 1 of 2 worlds; T is not measured there"
+    assert str(found) == told
+    # The same where a calibrator fails, or cannot work, in the other world.
+    for lost, reason in ((case(9.0, 0.1, transfer=-0.5), "T -0.5"), (None, "cannot work")):
+        failed = standing_of(case(0.0, 0.01, transfer=0.8), lost, refusals=[("sources missing", "name", "why")])
+        assert advice([failed])[1] == (
+            "k 0.1 to 0.2 h/Mpc: no calibrator passes; "
+            f"name keeps much (T ≥ 0.80 where measured, 1 of 2 worlds), but fails in sources missing ({reason})"
+        )
+    assert "where" not in str(standing_of(case(0.0, 0.01), case(0.0, 0.01)))
