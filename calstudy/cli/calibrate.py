@@ -276,7 +276,7 @@ def compare_gains(
     from calstudy.base.gains import at_common_channels
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.plotting import style
-    from calstudy.plotting.save import figure_arrays, save_figure
+    from calstudy.plotting.style import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():

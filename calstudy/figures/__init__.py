@@ -40,7 +40,7 @@ class Drawing(NamedTuple):
     figure
         From matplotlib.
     shown
-        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.save.figure_arrays`).
+        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.style.figure_arrays`).
     notes
         JSON-able, kept in the record of the product.
     """
@@ -258,7 +258,7 @@ class Draw(Task, stage="figure", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the figure as png and pdf, and its arrays as npz."""
-        from calstudy.plotting.save import figure_arrays, save_figure
+        from calstudy.plotting.style import figure_arrays, save_figure
 
         drawing = self.drawing(output)
         try:

@@ -11,7 +11,7 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.gains import inspected_calibration
 from calstudy.plotting import style
-from calstudy.plotting.domains import TAPER, mark_horizon, name_baseline
+from calstudy.plotting.axes import TAPER, mark_horizon, name_baseline
 from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay
 from calstudy.products import corruption
 from calstudy.products.files import DATA, MODEL, RESIDUAL

@@ -11,7 +11,7 @@ import numpy as np
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.gains import inspected, inspected_calibration
 from calstudy.plotting import style
-from calstudy.plotting.domains import (
+from calstudy.plotting.axes import (
     TwoDomains,
     delay_panel,
     frequency_and_delay,

@@ -10,7 +10,7 @@ import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.plotting.axes import cells, delay_axis, draw_horizon, label_axes
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 

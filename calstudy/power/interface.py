@@ -74,7 +74,7 @@ def estimate_spectra(
         If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, or if even and odd
         data have different numbers of integrations.
     """
-    from calstudy.power.errors import independent_times
+    from calstudy.power.binned import independent_times
 
     estimator = cast(Estimator, settings.estimator)
     found = []

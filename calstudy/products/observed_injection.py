@@ -276,8 +276,7 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T, spectra of the injected EoR, and the power of the residual corrected by T."""
-        from calstudy.power.binned import spherical_average
-        from calstudy.power.errors import with_errors
+        from calstudy.power.binned import spherical_average, with_errors
         from calstudy.power.spectra import SphericalSpectrum
 
         found = self.read()

@@ -133,8 +133,7 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
         """Return the spherical spectra by their modes, with errors by the noise of each baseline."""
         from dataclasses import replace
 
-        from calstudy.power.binned import modes_in_bins, spherical_average
-        from calstudy.power.errors import noise_error, with_errors
+        from calstudy.power.binned import modes_in_bins, noise_error, spherical_average, with_errors
         from calstudy.realdata.noise import noise_of_units
 
         of_units, found = noise_of_units(spectra, noise, level), {}

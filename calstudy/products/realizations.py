@@ -167,9 +167,8 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectra, and the input power at the same k."""
-        from calstudy.power.binned import make_bin_edges, spherical_average
+        from calstudy.power.binned import make_bin_edges, noise_level, spherical_average, with_errors
         from calstudy.power.cosmology import input_power
-        from calstudy.power.errors import noise_level, with_errors
 
         power = self.power
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}

@@ -200,8 +200,7 @@ class Spectra(Task, stage="spectra", version=3, cost=Cost(2, disk=5e6)):
         """Write, for every variant, wedge.h5 and the two spherical spectra, as HDF5 and CSV."""
         import numpy as np
 
-        from calstudy.power.binned import cylindrical_average, spherical_average
-        from calstudy.power.errors import noise_level, with_errors
+        from calstudy.power.binned import cylindrical_average, noise_level, spherical_average, with_errors
 
         reference = {name: read_delay_spectra(folder) for name, folder in self.reference.items()}
         sigma_noise = noise_level(reference["noise"]) if "noise" in reference else 0.0

@@ -35,7 +35,7 @@ from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
 from calstudy.verdicts.statement import Statement, Unevaluated
 
-STEPS: Registry[Step] = Registry("step", "calstudy.validation.steps", "calstudy.validation.step:Step")
+STEPS: Registry[Step] = Registry("step", "calstudy.validation.steps", "calstudy.validation.step:Step", families=True)
 FINDINGS = "measurement.json"
 CHAIN = "validation/small/chain.yaml"
 """The experiment of all steps at small scale."""

@@ -23,7 +23,7 @@ from calstudy.figures.visibilities import (
 )
 from calstudy.figures.wedge import WedgePanels, draw_wedge
 from calstudy.plotting import style
-from calstudy.plotting.domains import in_two_domains
+from calstudy.plotting.axes import in_two_domains
 from calstudy.power.delay import delays
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 
