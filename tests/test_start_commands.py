@@ -15,8 +15,7 @@ from tiny import tiny
 
 from calstudy.base.package_files import experiment_names, published
 from calstudy.cli import main as cli
-from calstudy.experiment.files import dump, override, validate
-from calstudy.experiment.yaml_files import parse_yaml
+from calstudy.experiment.files import dump, override, parse_yaml, validate
 from calstudy.run.store import Store
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import SCHEMA_FILE, experiment_schema

@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.gain_tables import PARALLEL_HANDS, SECONDS_PER_DAY, GainTable
+from calstudy.base.gain_tables import PARALLEL_HANDS, GainTable
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, positions
 
@@ -66,7 +67,7 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
         channel_width=template.channel_width,
         flex_spw_id_array=template.flex_spw_id_array,
         spw_array=template.spw_array,
-        integration_time=float(np.ptp(times) * 86400 + template.integration_time[0])
+        integration_time=float(np.ptp(times) * SECONDS_PER_DAY + template.integration_time[0])
         if constant
         else float(template.integration_time[0]),
         # pyuvdata numbers the Jones element Jxx of a feed like the polarization xx, and Jyy like yy.

@@ -169,8 +169,7 @@ def _calibration(path: Path | None, changes: Mapping[str, Any]) -> dict[str, Any
     directory.
     """
     from calstudy.calibrate.interface import CALIBRATORS
-    from calstudy.experiment.files import override
-    from calstudy.experiment.yaml_files import read_mapping
+    from calstudy.experiment.files import override, read_mapping
 
     content: dict[str, Any] = {}
     if path is not None:

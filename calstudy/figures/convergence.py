@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from calstudy.experiment.model import Experiment
 
-SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
 LOWEST = 1e-3
 TOTAL = r"$P^{R}/P^{S}$, EoR in the data"
@@ -65,7 +64,7 @@ def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[in
         raise ValueError("a figure of convergence has no solver, expected at least one")
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2)
-    for path, (marker, colour) in zip(paths, SERIES, strict=False):
+    for path, (marker, colour) in zip(paths, style.SERIES, strict=False):
         _draw_bias(left, path, marker, colour)
         right.errorbar(
             path.steps,

@@ -39,6 +39,9 @@ MAGENTA = "#CC79A7"
 GREY = "#6E6E6E"
 BAND = "#C9C9C9"
 
+SERIES = (("o", BLUE), ("s", ORANGE), ("D", GREEN), ("^", MAGENTA), ("v", RED))
+"""Marker and colour of several series of points."""
+
 FREQUENCY = "frequency (MHz)"
 DELAY = "delay (ns)"
 WAVENUMBER = r"$k$ ($h\,\mathrm{Mpc}^{-1}$)"

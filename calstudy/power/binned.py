@@ -31,7 +31,7 @@ from astropy import constants
 
 from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, outside_wedge
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, bins_of_k, outside_wedge
 
 NEGLIGIBLE = 1e-3
 """Correlations of powers below this are taken as zero."""
@@ -175,10 +175,7 @@ def modes_in_bins(
     spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
 ) -> np.ndarray:
     """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those left out; parameters as in `spherical_average`."""
-    edges = make_bin_edges(settings.bins)
-    magnitude = np.hypot(spectra.k_perp[:, None], spectra.k_parallel)
-    bins = np.searchsorted(edges, magnitude, side="left") - 1
-    bins[(bins < 0) | (bins >= edges.size - 1)] = -1
+    bins = bins_of_k(spectra, make_bin_edges(settings.bins))
     if exclude_wedge:
         bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
     if only_wedge:

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.power.spectra import outside_wedge
+from calstudy.power.spectra import bins_of_k, outside_wedge
 
 if TYPE_CHECKING:
     from calstudy.power.spectra import DelaySpectra
@@ -194,10 +194,9 @@ def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
 def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
     """Return the clusters of the modes in bins of |k|, outside or inside the wedge; each unit is a sample.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with
-    |tau| <= |b|/c + `buffer` (s) are inside the wedge.
+    `edges` are as in `calstudy.power.spectra.bins_of_k`. Modes with |tau| <= |b|/c + `buffer` (s) are inside the wedge.
     """
-    bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
-    bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1
+    bins = bins_of_k(spectra, edges)
+    bins[outside_wedge(spectra, buffer) == inside] = -1
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
     return Clusters.of(spectra, bins, samples, edges.size - 1)

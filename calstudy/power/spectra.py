@@ -193,6 +193,16 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
     return np.abs(modes.delay) > horizon[:, None] + buffer
 
 
+def bins_of_k(modes: DelaySpectra | BaselineModes, edges: np.ndarray) -> np.ndarray:
+    """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those in none.
+
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge.
+    """
+    bins = np.searchsorted(edges, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
+    bins[bins >= edges.size - 1] = -1
+    return bins
+
+
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:
     """Return the spectra of the units that all have in common, each averaged over the same pairs of baselines.
 

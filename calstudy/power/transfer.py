@@ -71,7 +71,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.verdicts.measured import is_measured
+from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
     from pyuvdata import UVData

@@ -17,8 +17,7 @@ from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, 
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
-from calstudy.verdicts.measured import is_measured, marked
-from calstudy.verdicts.standing import advice, standing_table, standings
+from calstudy.verdicts.standing import advice, is_measured, marked, standing_table, standings
 
 CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}

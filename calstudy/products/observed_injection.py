@@ -35,7 +35,7 @@ from calstudy.products.table import StudyTable
 from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Task, called
 from calstudy.simulate.interface import SimulationSize
-from calstudy.verdicts.measured import HIGHEST, LARGEST_ERROR, LOWEST
+from calstudy.verdicts.standing import HIGHEST, LARGEST_ERROR, LOWEST
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -42,7 +42,7 @@ from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
-from calstudy.verdicts.measured import marked, why_not_measured
+from calstudy.verdicts.standing import marked, why_not_measured
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -181,7 +181,7 @@ def write_transfer(
     """Write T per k outside and inside the wedge, in fine bins and in bands, and per (|b|, tau).
 
     The flux scale of the calibration is NaN if it is not known. With `only_measured`, T per k is NaN where it is not
-    measured (`calstudy.verdicts.measured`). Return T in bands, as plain JSON types, by part of Fourier space, with why
+    measured (`calstudy.verdicts.standing`). Return T in bands, as plain JSON types, by part of Fourier space, with why
     it is not measured.
     """
     from calstudy.power.binned import make_bin_edges

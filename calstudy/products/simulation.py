@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.constants import SECONDS_PER_DAY, SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.instrument.layouts import layout_of, size_of_instrument
@@ -19,7 +19,6 @@ from calstudy.run.task import Piece, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import (
     EARTH_ROTATION_RATE,
-    SECONDS_PER_DAY,
     Accuracy,
     chebyshev_count,
     frequency_bandwidth,

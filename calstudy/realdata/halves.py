@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.instrument.settings import Channels, Size
@@ -28,7 +29,6 @@ WHOLE = "whole"
 """The part that is all of the data."""
 FEED_TOLERANCE = np.radians(1)
 LEAST_CHANNELS = 8
-SECONDS_PER_DAY = 86400.0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from calstudy.base.errors import InputError
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.measured import marked, why_not_measured
+from calstudy.verdicts.standing import marked, why_not_measured
 from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
 BAND = (0.2, 0.5)

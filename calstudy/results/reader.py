@@ -25,9 +25,8 @@ from calstudy.base.table import Table, from_json
 from calstudy.calibrate.agreement import Statistic
 from calstudy.calibrate.agreement import from_json as statistics_from_json
 from calstudy.experiment.assumed import assumed_changes
-from calstudy.experiment.files import validate
+from calstudy.experiment.files import read_mapping, validate
 from calstudy.experiment.model import Experiment
-from calstudy.experiment.yaml_files import read_mapping
 from calstudy.power.expected import ExpectedBins
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum

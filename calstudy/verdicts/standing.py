@@ -3,7 +3,7 @@
 In a band of k, a calibrator
 
 - *passes* in a world if its bias is below the limit by two standard deviations, |bias| + 2 sigma < limit, and T is
-  measured (`calstudy.verdicts.measured`),
+  measured (`calstudy.verdicts.standing`),
 - *fails* if it is above by two standard deviations, if T is not that of a solution (below -0.1 or above 1.2 by more
   than two standard deviations), or if the calibrator cannot work there,
 - is *open* otherwise: the errors of this run are too large to tell. Without a bias, the measured one is about sigma,
@@ -21,7 +21,30 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from calstudy.base.table import Table
-from calstudy.verdicts.measured import HIGHEST, LOWEST, is_measured
+
+LOWEST, HIGHEST = -0.1, 1.2
+LARGEST_ERROR = 0.3
+"""Standard deviation above which T is not measured."""
+
+
+def is_measured(transfer: float | None, error: float | None) -> bool:
+    """Return whether T is measured; a T or an error that is None is not known."""
+    return why_not_measured(transfer, error) == ""
+
+
+def why_not_measured(transfer: float | None, error: float | None) -> str:
+    """Explain in a few words why T is not measured; return an empty text where it is."""
+    if error is not None and error > LARGEST_ERROR:
+        return f"error {error:.2g}"
+    if transfer is None or math.isnan(transfer):
+        return "no modes"
+    return "" if LOWEST <= transfer <= HIGHEST else f"T {transfer:.2g}"
+
+
+def marked(text: str, transfer: float | None, error: float | None) -> str:
+    """Return T as it is written, in brackets after "not measured" where it is not."""
+    return f"not measured ({text})" if why_not_measured(transfer, error) else text
+
 
 Standing = Literal["passes", "open", "fails"]
 WORST = ("fails", "open", "passes")

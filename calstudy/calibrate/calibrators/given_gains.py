@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import FileName, require_inside
-from calstudy.base.gain_files import GainTable, read_gain_file, read_gains
+from calstudy.base.gain_files import read_gain_file, read_gains
+from calstudy.base.gain_tables import GainTable
 from calstudy.base.gains import require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
@@ -29,7 +31,6 @@ from calstudy.instrument.settings import Size
 if TYPE_CHECKING:
     from pyuvdata import UVCal
 
-SECONDS_PER_DAY = 86400.0
 MANIFEST = "manifest.json"
 GAINS_SUFFIXES = (".calh5", ".calfits", ".cal", ".h5", ".fits", ".bin")
 """CalH5, calfits, a CASA table, H5Parm, and files of hyperdrive and calibrate."""

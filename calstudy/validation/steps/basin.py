@@ -29,8 +29,8 @@ from calstudy.calibrate.settings import InitialGains, UnityStart
 from calstudy.corrupt.levels import rms
 from calstudy.plotting import style
 from calstudy.plotting.style import figure_arrays, save_figure
-from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationStep
 from calstudy.validation.step import Findings, Limit, StepInput
+from calstudy.validation.steps.single_fit import SingleIntegration, SingleIntegrationStep
 from calstudy.verdicts.criterion import AtMost, Finding
 
 if TYPE_CHECKING:

@@ -42,8 +42,8 @@ from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
 from calstudy.products.gain_errors import gain_coverage, read_coverage
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.single_integration import first_integrations
 from calstudy.validation.step import MINREDUNDANT, Case, Findings, Limit, Step, StepInput, only, required
+from calstudy.validation.steps.single_fit import first_integrations
 from calstudy.verdicts.criterion import AtMost, Finding, Within
 
 HUGE = 1e6
