@@ -11,7 +11,7 @@ import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
-from calstudy.calibrate.gain_coverage import EXPECTED, GainCoverage
+from calstudy.calibrate.agreement import EXPECTED, GainCoverage
 from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.plotting import style
 from calstudy.products.corruption import PARITIES

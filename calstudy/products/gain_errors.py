@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from calstudy.calibrate.gain_coverage import GainCoverage
+    from calstudy.calibrate.agreement import GainCoverage
     from calstudy.calibrate.gain_errors import GainErrors
     from calstudy.calibrate.records import CalibrationResult
 
@@ -210,7 +210,7 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=2):
 
         import numpy as np
 
-        from calstudy.calibrate.gain_coverage import GainCoverage, pulls
+        from calstudy.calibrate.agreement import GainCoverage, pulls
         from calstudy.products.selection import read_gains
 
         result, found, reasons = read_result(self.calibration), [], []
@@ -233,7 +233,7 @@ def read_coverage(folder: Path) -> GainCoverage:
     """Read the fractions of all solves."""
     import numpy as np
 
-    from calstudy.calibrate.gain_coverage import GainCoverage
+    from calstudy.calibrate.agreement import GainCoverage
 
     with np.load(folder / COVERAGE, allow_pickle=False) as arrays:
         return GainCoverage(**arrays)
