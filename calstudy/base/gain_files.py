@@ -13,6 +13,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,8 +24,6 @@ from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gain_tables import PARALLEL_HANDS, GainTable
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import h5py
     from pyuvdata import UVCal, UVData
 

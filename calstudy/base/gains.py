@@ -6,6 +6,7 @@ by g_a g_b*.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +19,6 @@ SAME_CHANNEL = 0.1
 """Channels of two files are the same if they differ by less than this, in units of their width."""
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVCal, UVData
 
 

@@ -13,7 +13,7 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
 from calstudy.calibrate.agreement import ratio_over_antennas
 from calstudy.calibrate.settings import GainFit, GainWeights
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.products.convergence import PATHS, followed
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.experiment.model import Experiment
 
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
 LOWEST = 1e-3

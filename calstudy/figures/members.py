@@ -17,6 +17,7 @@ from calstudy.figures.spherical import Marking, SphericalColumn, draw_band, draw
 from calstudy.plotting import style
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import SPHERICAL_RULES, Drawn, Rules
 
@@ -41,8 +42,6 @@ class MemberBias:
 
 def read_member(folder: Path) -> MemberBias:
     """Read the bias of a member from its scores."""
-    from calstudy.results.reader import Tables
-
     bins = Tables((folder,)).score
     return MemberBias(bins.k, bins.bias, bins.bias_error)
 

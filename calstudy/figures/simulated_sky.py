@@ -22,7 +22,7 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
 from calstudy.plotting import style
 from calstudy.plotting.axes import cells, draw_horizon, label_axes
-from calstudy.power.binned import cylindrical_average
+from calstudy.power.binned import cylindrical_average, spherical_average, with_errors
 from calstudy.power.cosmology import input_power
 from calstudy.power.delay import delay_transform, delays, horizon_delay
 from calstudy.power.interface import estimate_spectra
@@ -216,8 +216,6 @@ def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment)
 
     The beam, power section and levels are those of the experiment.
     """
-    from calstudy.power.binned import spherical_average, with_errors
-
     settings = experiment.power
     levels = set_levels(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption)
     of_foregrounds, of_eor = (_delay_spectra(data, experiment) for data in (foregrounds, eor))

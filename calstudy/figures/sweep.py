@@ -16,15 +16,16 @@ from calstudy.experiment.files import short_names
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER
 from calstudy.plotting import style
+from calstudy.power.transfer import TransferFunction, pool
 from calstudy.products import signal_loss
 from calstudy.products.graph import Graph, required
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.power.transfer import TransferFunction
 
 SKIES = "sky.eor.seed"
 """The field whose values are further samples of the same EoR, to be pooled."""
@@ -157,15 +158,11 @@ class Sweep(StudyFigure):
 
 
 def _bands(folder: Path) -> TransferFunction:
-    from calstudy.results.reader import Tables
-
     return Tables((folder,)).transfer_in_bands("outside-wedge")
 
 
 def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:
     """Return one block as a panel: a category per combination of values, with its EoR skies pooled."""
-    from calstudy.power.transfer import pool
-
     fields = list(block[0]["changes"])
     varied = [field for field in fields if len({point["changes"][field] for point in block}) > 1] or fields[:1]
     shown = [field for field in varied if field != SKIES] or varied

@@ -27,8 +27,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from astropy import constants
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, bins_of_k, outside_wedge
@@ -122,7 +122,7 @@ def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, 
     """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
     from scipy.spatial import cKDTree
 
-    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / constants.c.value) ** 2
+    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / SPEED_OF_LIGHT) ** 2
     reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
     tree = cKDTree(spectra.vectors)
     units = np.arange(len(spectra.vectors))

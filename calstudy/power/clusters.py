@@ -27,15 +27,10 @@ fixed by the number of unknowns, which does not appear in any scatter.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.power.spectra import bins_of_k, outside_wedge
-
-if TYPE_CHECKING:
-    from calstudy.power.spectra import DelaySpectra
-
+from calstudy.power.spectra import DelaySpectra, bins_of_k, outside_wedge
 
 LARGEST_PART = 0.5
 """Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score, difference
+from calstudy.power.tables import load_spectrum
 from calstudy.products import spectra
 from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, json_number, read_json
 from calstudy.products.graph import size_of
@@ -82,8 +84,6 @@ def read_cases(
 
 
 def _read(folder: Path) -> Case:
-    from calstudy.power.tables import load_spectrum
-
     bins, bands = (load_spectrum(folder / name, Score) for name in (SCORE_BINS, SCORE_BANDS))
     return Case(bins, bands, read_json(folder / SCORE))
 
@@ -119,8 +119,6 @@ class Comparison(Task, stage="comparison", version=5):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write comparison.csv, comparison.json and comparison.md."""
-        import json
-
         cases = read_cases(self.calibrators, self.worlds, self.cases)
         less = {world: self.differences(world, found) for world, found in cases.items()}
         Table.of_records(list(_csv_rows(cases))).write_csv(output / CSV)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,6 @@ import numpy as np
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pyuvdata import UVData
     from pyuvdata.uvdata import FastUVH5Meta
 

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from calstudy.base.errors import InputError
+from calstudy.base.gains import write_gain_errors
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import positions
+from calstudy.base.visibilities import positions, to_cube
+from calstudy.calibrate.agreement import GainCoverage, pulls
+from calstudy.calibrate.gain_errors import MOST_UNKNOWNS, ErrorsInTime, GainErrors
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
@@ -18,12 +25,6 @@ from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
-    from calstudy.calibrate.agreement import GainCoverage
-    from calstudy.calibrate.gain_errors import GainErrors
     from calstudy.calibrate.records import CalibrationResult
 
 
@@ -90,10 +91,6 @@ class OfSolves(Calibrated):
 
     def solves(self, result: CalibrationResult) -> Iterator[SolvedGains]:
         """Yield the gains of every solve with their errors."""
-        import numpy as np
-
-        from calstudy.base.visibilities import to_cube
-        from calstudy.calibrate.gain_errors import ErrorsInTime
         from calstudy.calibrate.preparation import problem_at
 
         settings = self.calibrator
@@ -129,8 +126,6 @@ class OfSolves(Calibrated):
             yield SolvedGains(rows, times, place, gains, found)
 
     def _cost(self) -> Cost:
-        from calstudy.calibrate.gain_errors import MOST_UNKNOWNS
-
         size = size_of(self)
         matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
         blocks = size.antennas * (2 * size.channels.count) ** 2 * COMPLEX128 / 2
@@ -143,10 +138,6 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=3):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the gains with their errors, and a record for each solve."""
-        import numpy as np
-
-        from calstudy.base.gains import write_gain_errors
-
         result = read_result(self.calibration)
         errors = np.full((2, *result.gains.gain_array.shape), np.nan)
         records: list[dict[str, Any]] = []
@@ -173,8 +164,6 @@ def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> l
     Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The unevenness is the
     largest of all solves.
     """
-    import numpy as np
-
     sizes = np.where(np.isfinite(errors), np.abs(gains), np.nan)
     known = np.isfinite(sizes).any(axis=(1, 2, 3))
     if not known.any():
@@ -206,11 +195,6 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the fractions; raises InputError if no gains have errors."""
-        from dataclasses import asdict
-
-        import numpy as np
-
-        from calstudy.calibrate.agreement import GainCoverage, pulls
         from calstudy.products.selection import read_gains
 
         result, found, reasons = read_result(self.calibration), [], []
@@ -231,9 +215,5 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=2):
 
 def read_coverage(folder: Path) -> GainCoverage:
     """Read the fractions of all solves."""
-    import numpy as np
-
-    from calstudy.calibrate.agreement import GainCoverage
-
     with np.load(folder / COVERAGE, allow_pickle=False) as arrays:
         return GainCoverage(**arrays)

@@ -6,11 +6,16 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from calstudy.base.resources import Cost
 from calstudy.base.table import Table
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.power.binned import make_bin_edges
+from calstudy.power.delay import make_taper
 from calstudy.power.spectra import SphericalSpectrum, of_common_units
 from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_transfer_csv
 from calstudy.power.transfer import (
@@ -45,8 +50,6 @@ from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.standing import marked, why_not_measured
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from calstudy.power.settings import PowerSettings
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
@@ -184,8 +187,6 @@ def write_transfer(
     measured (`calstudy.verdicts.standing`). Return T in bands, as plain JSON types, by part of Fourier space, with why
     it is not measured.
     """
-    from calstudy.power.binned import make_bin_edges
-
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
@@ -251,9 +252,6 @@ class FluxScale(Task, stage="flux-scale", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the flux scale of the first polarization, null if it is not known, to scale.json."""
-        import numpy as np
-
-        from calstudy.power.delay import make_taper
         from calstudy.products.selection import read_gains, true_of
 
         ratios = []

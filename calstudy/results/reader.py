@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.gains import read_gain_errors
 from calstudy.base.table import Table, from_json
 from calstudy.calibrate.agreement import Statistic
 from calstudy.calibrate.agreement import from_json as statistics_from_json
@@ -232,8 +233,6 @@ def gain_errors(path: Path) -> xarray.Dataset:
     """
     import xarray
     from pyuvdata import UVCal
-
-    from calstudy.base.gains import read_gain_errors
 
     amplitude, phase = read_gain_errors(path)
     gains = UVCal.from_file(path)

@@ -18,6 +18,7 @@ from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.base.gain_files import CASACORE
+from calstudy.base.visibilities import flag_cube, from_cube, to_cube
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
@@ -117,8 +118,6 @@ def _write_world(content: WorldData, products: Mapping[str, Product], folder: Pa
 
 def _at(template: UVData, uvd: UVData) -> UVData:
     """Return visibilities and flags with the metadata of the template only."""
-    from calstudy.base.visibilities import flag_cube, from_cube, to_cube
-
     found = from_cube(template, to_cube(uvd))
     flag_cube(found)[:] = flag_cube(uvd)
     return found

@@ -25,7 +25,9 @@ from calstudy.base.gains import require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import FOLDER, UNKEYED, Section, fault
+from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress, Solve
+from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
@@ -131,9 +133,6 @@ class ByFile(Calibrator):
     def _model(self, observation: Observation) -> np.ndarray | None:
         if self.model is None:
             return None
-        from calstudy.base.visibilities import to_cube
-        from calstudy.calibrate.sky_model import read_sky_model
-
         return to_cube(read_sky_model(self.model, observation.uvd))
 
 

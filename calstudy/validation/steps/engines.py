@@ -16,8 +16,8 @@ from astropy.coordinates import AltAz, Longitude, SkyCoord
 from astropy.time import Time
 from pydantic import Field
 from pyradiosky import SkyModel
-from scipy.constants import speed_of_light
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.visibilities import baseline_vectors, subset_template
 from calstudy.corrupt.levels import rms
 from calstudy.instrument.beams import make_beam
@@ -155,7 +155,7 @@ def _closed_form(template: UVData, zenith_angle: float, azimuth: float) -> np.nd
     direction = np.array(
         [np.sin(zenith_angle) * np.sin(azimuth), np.sin(zenith_angle) * np.cos(azimuth), np.cos(zenith_angle)]
     )
-    turns = (baseline_vectors(template) @ direction)[:, None] * template.freq_array / speed_of_light
+    turns = (baseline_vectors(template) @ direction)[:, None] * template.freq_array / SPEED_OF_LIGHT
     # The width of the power beam is proportional to the wavelength.
     width = np.radians(BEAM.fwhm_deg) * BEAM.reference_frequency / template.freq_array
     power = np.exp(-4 * np.log(2) * (zenith_angle / width) ** 2)

@@ -45,11 +45,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from astropy import constants
 from pydantic import Field
-from scipy.constants import speed_of_light
 from scipy.stats import expon, goodness_of_fit
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.units import Wavenumber
 from calstudy.claims.bins import clustered_mean, pooled
 from calstudy.corrupt.levels import Levels
@@ -219,7 +218,7 @@ def thinned(power: np.ndarray, modes: DelaySpectra) -> np.ndarray:
     correlation = mode_correlation(modes.taper, modes.delay.size)
     step = int(np.argmax(correlation < UNCORRELATED))
     # See `calstudy.power.binned`: powers of two baselines correlate by the square of the beam's own transform.
-    rate = 2 * np.pi * modes.omega_pp * (modes.frequency / constants.c.value) ** 2
+    rate = 2 * np.pi * modes.omega_pp * (modes.frequency / SPEED_OF_LIGHT) ** 2
     reach = np.sqrt(-np.log(UNCORRELATED) / rate)
     kept: list[int] = []
     for index, vector in enumerate(modes.vectors):
@@ -302,7 +301,7 @@ class SteepSignal(Step):
         for run in runs.values():
             found = run.delay_spectra("eor")
             relative = found.power.real / windowed(run.input_power, found)
-            resolved = 2 * np.pi * found.length * found.frequency / speed_of_light + MARGIN
+            resolved = 2 * np.pi * found.length * found.frequency / SPEED_OF_LIGHT + MARGIN
             relative[resolved > 3 * run.experiment.sky.eor.nside - 1] = np.nan
             k = np.hypot(found.k_perp[:, None], found.k_parallel)
             whole.append(clustered_mean(np.where(k > self.k_min, relative, np.nan)))
