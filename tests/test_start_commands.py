@@ -75,8 +75,6 @@ def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
         (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
         (["fields", "--schema", "nowhere/schema.json"], "--schema nowhere/schema.json: cannot be written"),
-        (["examples"], "examples: is calstudy init --list"),
-        (["schema", "--output", "schema.json"], "schema: is calstudy fields --schema FILE"),
         (["runs", "nowhere"], "nowhere: no such folder of runs"),
         (["store", "nowhere"], "nowhere: no such store"),
         (["store", "store", "--delete"], "--delete: say which products"),

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score, difference
 from calstudy.power.tables import load_spectrum
 from calstudy.products import spectra
-from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, json_number, read_json
+from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task

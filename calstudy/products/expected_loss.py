@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import json_number
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
@@ -32,7 +33,6 @@ from calstudy.products.files import (
     MODEL,
     SOLUTION,
     integration_times,
-    json_number,
     read_json,
     read_visibilities,
     write_json,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
 from calstudy.calibrate.agreement import aligned_gains, gain_errors
@@ -29,7 +30,6 @@ from calstudy.products.files import (
     SCORE_BINS,
     SKY_MODEL_ERROR,
     SOLUTION,
-    json_number,
     read_in_parts,
     read_json,
     write_json,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.files import json_number
 from calstudy.base.resources import Cost
 from calstudy.base.table import Table
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
@@ -36,7 +37,6 @@ from calstudy.products.files import (
     AVERAGE,
     TRANSFER,
     TRANSFER_BANDS,
-    json_number,
     read_json,
     read_visibilities,
     spectrum_file,

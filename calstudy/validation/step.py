@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import json_number
 from calstudy.base.plugins import Registry, guarded
 from calstudy.base.resources import Cost
 from calstudy.base.schema import UNKEYED
@@ -27,7 +28,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.power.cosmology import input_power
 from calstudy.power.spectra import DelaySpectra
 from calstudy.products.corruption import LEVELS
-from calstudy.products.files import json_number, read_json, write_json
+from calstudy.products.files import read_json, write_json
 from calstudy.products.graph import Graph
 from calstudy.products.spectra import read_delay_spectra
 from calstudy.results.reader import Tables

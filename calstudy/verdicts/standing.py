@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from calstudy.base.table import Table
+from calstudy.base.table import Table, two_digits
 
 LOWEST, HIGHEST = -0.1, 1.2
 LARGEST_ERROR = 0.3
@@ -91,7 +91,7 @@ class InWorld:
         if self.refused:
             return f"{self.world} (cannot work)"
         is_solution = LOWEST <= self.transfer <= HIGHEST
-        return f"{self.world} ({f'bias {_short(self.bias)}' if is_solution else f'T {_short(self.transfer)}'})"
+        return f"{self.world} ({f'bias {two_digits(self.bias)}' if is_solution else f'T {two_digits(self.transfer)}'})"
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class InBand:
     def numbers(self) -> str:
         """The upper limit of the bias in all worlds, and the smallest T."""
         known = "T not measured" if math.isnan(self.transfer) else f"T ≥ {self.transfer:.2f}"
-        return f"bias < {_short(self.upper_limit)}, {known}"
+        return f"bias < {two_digits(self.upper_limit)}, {known}"
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -207,7 +207,9 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
         parts, least = [f"take {first.calibrator} ({first.numbers})"], first.transfer + MORE
         largest = first.decisive[0]
         seen = abs(largest.bias) > SIGMAS * largest.bias_error
-        parts.append(f"its bias is largest in {largest.world} ({_short(largest.bias)})" if seen else "no bias is seen")
+        parts.append(
+            f"its bias is largest in {largest.world} ({two_digits(largest.bias)})" if seen else "no bias is seen"
+        )
         parts += [f"others that pass: {_listed(others)}"] if others else []
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
@@ -235,7 +237,3 @@ def standing_table(found: Sequence[InBand]) -> Table:
     columns = ("calibrator", *(f"k {low:g} to {high:g} h/Mpc" for low, high in bands))
     rows = [(name, *(cells.get((name, band), "-") for band in bands)) for name in names]
     return Table(columns, rows, "Which calibrator to trust", note)
-
-
-def _short(value: float) -> str:
-    return f"{float(f'{value:.2g}'):,.10g}"
