@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
+from html import escape
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,7 +42,7 @@ from calstudy.products.files import (
 from calstudy.products.gain_errors import ERRORS
 from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
-from calstudy.results.reader import EXPERIMENT, RunFolder, Tables
+from calstudy.results.reader import EXPERIMENT, RunFolder, Tables, by_length_and_delay, by_wavenumber, gain_errors
 from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
@@ -160,8 +161,6 @@ class CalibratedData:
     @property
     def gain_errors(self) -> xarray.Dataset:
         """Standard deviations of gains by noise, `amplitude` and `phase`; InputError if the calibration has none."""
-        from calstudy.results.reader import gain_errors
-
         return gain_errors(self.folder / GAINS)
 
     @property
@@ -333,8 +332,6 @@ class OpenRun:
     @property
     def cylindrical(self) -> ByVariant:
         """Cylindrical power spectra, by variant: datasets with `power` against `baseline_length` and `delay`."""
-        from calstudy.results.reader import by_length_and_delay
-
         return self._by_variant(lambda name: by_length_and_delay(self._tables.wedge(name)))
 
     @property
@@ -350,8 +347,6 @@ class OpenRun:
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        from calstudy.results.reader import by_length_and_delay
-
         return by_length_and_delay(self._tables.transfer_map())
 
     @property
@@ -451,8 +446,6 @@ class OpenRun:
         InputError
             If they are not known for the calibrator or the size of the array, with the reason.
         """
-        from calstudy.results.reader import gain_errors
-
         self._calibration(variant, half)
         study = self._experiment
         task = errors_of_gains(study.graph, self._variant(variant), half)
@@ -505,8 +498,6 @@ class OpenRun:
         return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
 
     def _repr_html_(self) -> str:
-        from html import escape
-
         return f"<pre>{escape(repr(self))}</pre>"
 
     @property
@@ -538,14 +529,10 @@ class OpenRun:
         return ByVariant(self._tables.variants, read)
 
     def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
-        from calstudy.results.reader import by_wavenumber
-
         return lambda name: by_wavenumber(self._tables.spherical(name, modes))
 
     def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
         import xarray
-
-        from calstudy.results.reader import by_wavenumber
 
         found = [by_wavenumber(read(region)) for region in REGIONS]
         return xarray.concat(found, xarray.IndexVariable("region", list(REGIONS)), combine_attrs="override")

@@ -105,8 +105,8 @@ MUTATIONS = (
     ),
     Mutation(
         "bins off by one",
-        'bins = np.searchsorted(edges, magnitude, side="left") - 1',
-        'bins = np.searchsorted(edges, magnitude, side="left")',
+        'modes.k_parallel), side="left") - 1',
+        'modes.k_parallel), side="left")',
         SPECTRA,
     ),
     Mutation("the wedge inverted", "bins[~outside_wedge(", "bins[outside_wedge(", SPECTRA),

@@ -84,7 +84,7 @@ def test_an_installed_package_has_steps_and_references(installed, tmp_path):
     assert "9.9: not a step of the ladder (there are: -1, 0.0" in result.stderr
     read = (
         "from calstudy.base.package_files import reference_folder\n"
-        "from calstudy.regression.comparison import find_references, read_reference\n"
+        "from calstudy.regression import find_references, read_reference\n"
         "for folder in find_references([reference_folder()]):\n"
         "    print(folder.parents[2].name, folder.name, len(read_reference(folder).figures))\n"
     )

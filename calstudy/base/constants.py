@@ -1,4 +1,4 @@
-"""Physical constants, and one of statistics, without imports."""
+"""Constants of physics, of the calendar and of statistics, without imports."""
 
 HYDROGEN_LINE = 1420405751.768
 """Rest frequency of the 21 cm line, Hz."""
@@ -6,5 +6,6 @@ SPEED_OF_LIGHT = 299_792_458.0
 """Speed of light, m/s."""
 BOLTZMANN = 1.380649e-23
 """Boltzmann constant, J/K."""
+SECONDS_PER_DAY = 86400.0
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,11 @@ def digest_json(value: Any) -> str:
     """Return a 32-digit key of any JSON-able value, which does not depend on the order of keys in it."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def json_number(value: float) -> float | None:
+    """Return a number for JSON: None if it is not finite."""
+    return float(value) if math.isfinite(value) else None
 
 
 @contextmanager

@@ -13,17 +13,17 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.gain_tables import PARALLEL_HANDS, SECONDS_PER_DAY, GainTable
+from calstudy.base.gain_tables import PARALLEL_HANDS, GainTable
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import h5py
     from pyuvdata import UVCal, UVData
 

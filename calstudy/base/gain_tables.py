@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 
 if TYPE_CHECKING:
     from pyuvdata import Telescope, UVCal, UVData
 
-SECONDS_PER_DAY = 86400.0
 PARALLEL_HANDS = {"XX": -5, "YY": -6, "RR": -1, "LL": -2}
 """AIPS numbers of parallel hands by name; pyuvdata numbers the gains of feeds alike."""
 

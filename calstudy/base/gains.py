@@ -6,10 +6,12 @@ by g_a g_b*.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, positions
 
@@ -17,8 +19,6 @@ SAME_CHANNEL = 0.1
 """Channels of two files are the same if they differ by less than this, in units of their width."""
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVCal, UVData
 
 
@@ -66,7 +66,7 @@ def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = N
         channel_width=template.channel_width,
         flex_spw_id_array=template.flex_spw_id_array,
         spw_array=template.spw_array,
-        integration_time=float(np.ptp(times) * 86400 + template.integration_time[0])
+        integration_time=float(np.ptp(times) * SECONDS_PER_DAY + template.integration_time[0])
         if constant
         else float(template.integration_time[0]),
         # pyuvdata numbers the Jones element Jxx of a feed like the polarization xx, and Jyy like yy.

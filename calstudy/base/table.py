@@ -116,3 +116,8 @@ def number(value: float, uncertainty: float | None = None) -> str:
     size = f"{value:.3g}" if abs(value) >= LARGE else f"{value:.{places}f}"
     plain = uncertainty >= 100 and abs(value) < LARGE
     return f"{size} ± {uncertainty:.0f}" if plain else f"{size} ± {uncertainty:.2g}"
+
+
+def two_digits(value: float) -> str:
+    """Write a number with two digits, without an exponent."""
+    return f"{float(f'{value:.2g}'):,.10g}"

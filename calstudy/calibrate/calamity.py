@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.observation import Observation
 from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import sky_model_slope
@@ -110,7 +111,7 @@ def _solve_all(
                     start = warm if settings.solver.warm_start else None
                     if settings.estimates_deviation or isinstance(settings.weights, GainWeights):
                         known = deviations if settings.solver.warm_start else None
-                        seed = round(float(prepared.data.times[times.start]) * 86400), p
+                        seed = round(float(prepared.data.times[times.start]) * SECONDS_PER_DAY), p
                         solution, warm, deviations = _Passes(settings, solver, seed).solve(problem, start, known)
                     else:
                         solution, warm, anew = _solve(problem, solver, start, anew)

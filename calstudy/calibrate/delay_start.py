@@ -25,11 +25,11 @@ that an antenna without signal does not change the delays of the others.
 from __future__ import annotations
 
 import numpy as np
-from scipy.constants import speed_of_light
 from scipy.fft import fft, ifft, next_fast_len
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.calibrate.basis import channel_grid
@@ -151,7 +151,7 @@ class _DelayFit:
         scores = np.zeros((len(spectra), self.n_delays), np.float32)
         steps, width = np.arange(self.n_delays), self.grid.width
         lags = np.minimum(steps, self.n_delays - steps)
-        sigma = 0.5 * self.lengths / speed_of_light + 0.5 / (self.grid.n_channels * width)
+        sigma = 0.5 * self.lengths / SPEED_OF_LIGHT + 0.5 / (self.grid.n_channels * width)
         if np.exp(-0.5 * (2 * np.pi * width * sigma.min()) ** 2) < LEAST_CORRELATION:
             raise InputError(
                 f"calibration.initial_gains: 'delays' needs a sky model where the shortest baseline has "
@@ -271,7 +271,7 @@ def _sky_gradient(delays: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """
     if len(delays) <= 3:
         return np.zeros(len(delays))
-    columns = np.column_stack([np.ones(len(delays)), positions[:, :2] / speed_of_light])
+    columns = np.column_stack([np.ones(len(delays)), positions[:, :2] / SPEED_OF_LIGHT])
     weights = np.ones(len(delays))
     for _ in range(ROBUST_ITERATIONS):
         root = np.sqrt(weights)

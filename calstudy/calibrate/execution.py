@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import FILE_REFERENCE, guarded
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
 EIGENVALUE_CUTOFF = 1e-9
 """Sequences with a smaller concentration are left out, as hera_cal does."""
-SECONDS_PER_DAY = 86400.0
 
 
 def smooth(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import json_number
 from calstudy.base.gains import make_uvcal
 from calstudy.base.visibilities import from_cube
 
@@ -93,15 +94,15 @@ class Solve:
             "status": self.status,
             "message": self.message,
             "n_steps": self.steps,
-            "first_loss": _number(losses[0]) if losses.size else None,
-            "last_loss": _number(losses[-1]) if losses.size else None,
+            "first_loss": json_number(losses[0]) if losses.size else None,
+            "last_loss": json_number(losses[-1]) if losses.size else None,
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
-            "newton_decrement": _number(self.newton_decrement),
-            "decrement_rms": _number(self.decrement_rms),
+            "newton_decrement": json_number(self.newton_decrement),
+            "decrement_rms": json_number(self.decrement_rms),
             "peak_memory": self.peak_memory,
             **({"diagnostics": dict(self.diagnostics)} if self.diagnostics else {}),
-            "loss_history": [_number(loss) for loss in losses],
+            "loss_history": [json_number(loss) for loss in losses],
         }
 
     @classmethod
@@ -112,11 +113,6 @@ class Solve:
         losses = np.array(fields.pop("loss_history", ends), float)
         numbers = {name: np.nan if fields[name] is None else fields[name] for name in NOT_FINITE}
         return cls(steps=fields.pop("n_steps"), loss_history=losses, **{**fields, **numbers})
-
-
-def _number(value: float) -> float | None:
-    """Return a float for JSON, None if it is not finite."""
-    return float(value) if np.isfinite(value) else None
 
 
 @dataclass(frozen=True, eq=False)

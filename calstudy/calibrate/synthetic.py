@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.constants import speed_of_light
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.calibrate.basis import make_basis
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.settings import BasisSettings
@@ -72,7 +72,7 @@ class Simulation:
         angle = SIDEREAL_RATE * self.case.integration * integration
         east = self._east + angle * np.sqrt(np.maximum(1 - self._east**2 - self._north**2, 0))
         up = np.sqrt(np.maximum(1 - east**2 - self._north**2, 0))
-        delay = self.positions @ np.stack([east, self._north, up]) / speed_of_light
+        delay = self.positions @ np.stack([east, self._north, up]) / SPEED_OF_LIGHT
         first, second = self.antennas.T
         result = np.empty((len(self.antennas), self.case.channels), complex)
         for channel, frequency in enumerate(self.case.frequencies):

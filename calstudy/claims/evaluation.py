@@ -17,9 +17,9 @@ from calstudy.base.user_code import without_code_of_files
 from calstudy.calibrate.settings import GainFit
 from calstudy.claims.paper import Paper
 from calstudy.claims.realizations import PooledResults
-from calstudy.claims.run_times import RUN_TIME, RunTimes
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import PAPERS, Experiment
+from calstudy.products.run_times import RUN_TIME, RUNTIME, RunTimeTable
 from calstudy.results.reader import Results, RunFolder, Tables
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.criterion import Verdict
@@ -68,7 +68,7 @@ def _told(paper: Paper, refusals: Mapping[str, str | None]) -> str:
     return f"The run plays no role in {paper.label}: {reasons or 'the paper has none'}."
 
 
-def evaluate_run_times(papers: Sequence[Paper], run: RunTimes) -> Evaluation:
+def evaluate_run_times(papers: Sequence[Paper], run: RunTimeTable) -> Evaluation:
     """Evaluate the statements of papers on run times."""
     verdicts: list[Verdict] = []
     without_role = []
@@ -130,7 +130,7 @@ def _accepted(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> dict
 
 
 def _evaluate(
-    paper: Paper, runs: Mapping[str, Results | PooledResults | RunTimes], only_played: bool = False
+    paper: Paper, runs: Mapping[str, Results | PooledResults | RunTimeTable], only_played: bool = False
 ) -> list[Verdict]:
     """Evaluate the statements of a paper; with `only_played`, only those with a role that a run plays."""
     found = []
@@ -220,7 +220,7 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
 def _evaluated(run: RunFolder, named: Sequence[Paper]) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
     """Return the verdicts of a folder, and those by solver of a collection."""
     if run.manifest.get("kind") == "runtime":
-        times = RunTimes.of(run.name, run.tables)
+        times = _run_times(run.name, run.tables)
         return evaluate_run_times(_named(named, run.content.get("papers", ()), run.path), times), {}
     if "members" in run.manifest:
         held_to, runs = _played(run, named)
@@ -354,6 +354,10 @@ class Claims(Task, stage="claims", version=12, cost=Cost(1, disk=1e5)):
         return Results(tuple(folder for folder in tables if folder is not None), experiment)
 
 
+def _run_times(name: str, tables: Tables) -> RunTimeTable:
+    return RunTimeTable.read(name, tables.path(RUNTIME, "the run has no table of run times"))
+
+
 class RunTimeClaims(Task, stage="runtime-claims", version=4, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on a run-time study."""
 
@@ -363,7 +367,7 @@ class RunTimeClaims(Task, stage="runtime-claims", version=4, cost=Cost(1, disk=1
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write claims.json and claims.md."""
-        times = RunTimes.of(self.title, Tables((self.runtime,)))
+        times = _run_times(self.title, Tables((self.runtime,)))
         return _write(output, evaluate_run_times(self.papers, times), self.title)
 
 

@@ -169,8 +169,7 @@ def _calibration(path: Path | None, changes: Mapping[str, Any]) -> dict[str, Any
     directory.
     """
     from calstudy.calibrate.interface import CALIBRATORS
-    from calstudy.experiment.files import override
-    from calstudy.experiment.yaml_files import read_mapping
+    from calstudy.experiment.files import override, read_mapping
 
     content: dict[str, Any] = {}
     if path is not None:
@@ -276,7 +275,7 @@ def compare_gains(
     from calstudy.base.gains import at_common_channels
     from calstudy.calibrate.gain_comparison import compare_gains, pair_gains
     from calstudy.plotting import style
-    from calstudy.plotting.save import figure_arrays, save_figure
+    from calstudy.plotting.style import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():

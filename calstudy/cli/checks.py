@@ -13,7 +13,7 @@ from calstudy.base.errors import InputError
 from calstudy.cli.options import AsJson, MaxMemory, Scheduler, Set, Workers
 
 if TYPE_CHECKING:
-    from calstudy.regression.comparison import Regression
+    from calstudy.regression import Regression
 
 
 EXIT_MOVED = 1
@@ -47,7 +47,7 @@ def regress(
     folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
-    from calstudy.regression.comparison import accept, find_references, remake, show, write_json
+    from calstudy.regression import accept, find_references, remake, show, write_json
     from calstudy.run.execution import Budget
 
     console = Console(soft_wrap=True, highlight=False)
@@ -77,7 +77,7 @@ def regress(
 
 
 def _compare(reference: Path, run: Path) -> Regression:
-    from calstudy.regression.comparison import Regression, compare_claims, compare_figures, read_reference, read_run
+    from calstudy.regression import Regression, compare_claims, compare_figures, read_reference, read_run
 
     old, new = read_reference(reference), read_run(run)
     claims = compare_claims(old.claims, new.claims, old.on_machines) if old.claims else []

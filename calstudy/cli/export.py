@@ -119,7 +119,7 @@ def score(
 def _blocks(folder: Path | None, calibrator: str | None, name: str | None) -> dict[str, Any] | None:
     """Return the calibrator to be scored by its label, or None for those of the file."""
     from calstudy.base.errors import InputError
-    from calstudy.experiment.yaml_files import parse_yaml
+    from calstudy.experiment.files import parse_yaml
 
     if folder is not None and calibrator is not None:
         raise InputError("--calibrator: cannot be given together with a folder of gains")

@@ -45,12 +45,6 @@ SECTIONS = {
     "Checks": ("validate", "regress"),
 }
 """Commands by section of the help."""
-MOVED = {
-    "check": "its checks are figures: calstudy run checks, or --set outputs.figures='[delay-floor]'",
-    "examples": "is calstudy init --list",
-    "schema": "is calstudy fields --schema FILE",
-}
-"""What took the place of commands of earlier versions."""
 
 
 @contextmanager
@@ -66,12 +60,6 @@ def named_as_options(renamed: Callable[[str], str]) -> Iterator[None]:
 
 class Sections(TyperGroup):
     """A group of commands whose help lists them by section."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; raises InputError with its new name if it has moved."""
-        if args and args[0] in MOVED:
-            raise InputError(f"{args[0]}: {MOVED[args[0]]}")
-        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands by section, and those of no section last."""

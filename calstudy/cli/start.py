@@ -1,15 +1,24 @@
-"""``calstudy init``, and the JSON schema: the first steps of an experiment file."""
+"""``calstudy init``, and the JSON schema: the first steps of an experiment file.
+
+`starter.yaml` is a small experiment with comments on possible changes, and `observed.yaml` one of measured data.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
+from string import Template
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+
+MODELINE = "# yaml-language-server: $schema="
+"""Start of the line from which editors know the schema of a file."""
+SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: factor, unit: 1 Jy}"
 
 Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.yaml.")]
 Example = Annotated[str | None, typer.Option(metavar="NAME", help="Copy a published experiment instead; see --list.")]
@@ -31,7 +40,6 @@ def init(
     With --data it is one of measured data: calibration, power spectra, and signal loss by injection.
     """
     from calstudy.base.package_files import published
-    from calstudy.experiment.starter import copy_text, observed_text, starter_text
     from calstudy.studies.reference import SCHEMA_FILE
 
     if listed:
@@ -54,7 +62,7 @@ def init(
 def _list_examples() -> None:
     from calstudy.base.package_files import experiment_names, published
     from calstudy.base.table import Table
-    from calstudy.experiment.yaml_files import read_mapping
+    from calstudy.experiment.files import read_mapping
     from calstudy.studies.study import kind_of
 
     rows = []
@@ -102,3 +110,52 @@ def write_schema(path: Path) -> None:
     except OSError as error:
         raise InputError(f"--schema {path}: cannot be written ({error.strerror})") from None
     typer.echo(f"{path}")
+
+
+def observed_text(name: str, schema: Path, beam: str, in_jansky: bool, searchable: bool, **entries: str) -> str:
+    """Return the text of a file about measured data; see `starter_text`.
+
+    `beam` is the name of a beam, `in_jansky` is true for data in Jy, and `searchable` for those that are enough for a
+    search for interference. The entries are ``path`` as it is written, ``summary``, a sentence, and ``first`` and
+    ``last``, the ends of the band.
+    """
+    _require_name(name)
+    optional = {"scale": "# " + SCALE if in_jansky else SCALE, "search": "" if searchable else "# "}
+    return f"{MODELINE}{schema}\n" + _filled("observed", name=name, beam=beam, **optional, **entries)
+
+
+def starter_text(name: str, schema: Path) -> str:
+    """Return the text of an experiment file with the path of the JSON schema, for editors.
+
+    Raises InputError if the name is not allowed.
+    """
+    _require_name(name)
+    return f"{MODELINE}{schema}\n" + _filled("starter", name=name)
+
+
+def copy_text(example: str, name: str, schema: Path) -> str:
+    """Return the text of a published experiment under another name; see `starter_text`."""
+    from calstudy.base.package_files import find_experiment
+    from calstudy.experiment.files import read_mapping
+
+    _require_name(name)
+    path = find_experiment(Path(example))
+    if {"experiments", "calibrators"} & set(read_mapping(path)):
+        raise InputError(f"--example {example}: is made of other files; copy one of those")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if not line.startswith(MODELINE)]
+    text = re.sub(r"^name: .*$", f"name: {name}", "\n".join(kept), count=1, flags=re.MULTILINE)
+    return f"{MODELINE}{schema}\n{text}\n"
+
+
+def _filled(template: str, **entries: str) -> str:
+    """Return the text of a file beside this module, with entries in place of their names."""
+    text = Path(__file__).with_name(f"{template}.yaml").read_text(encoding="utf-8")
+    return Template(text).substitute(entries)
+
+
+def _require_name(name: str) -> None:
+    from calstudy.experiment.model import STUDY_NAME
+
+    if not STUDY_NAME.fullmatch(name):
+        raise InputError(f"{name!r} cannot name an experiment: use at most 64 letters, digits, '_', '.', '-'")

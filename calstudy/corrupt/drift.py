@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.schema import Section, choice
 from calstudy.base.units import Delay, Frequency, Phase, Time
 
@@ -83,9 +84,6 @@ def _symmetric_root(covariance: np.ndarray) -> np.ndarray:
 
 
 Shape = Annotated[Polynomial | Delays | Correlated, choice("kind", "polynomial")]
-
-
-SECONDS_PER_DAY = 86400
 
 
 Antennas = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import Field, SerializeAsAny, model_validator
@@ -40,13 +39,6 @@ class CorruptionSettings(Section):
         """The first effect on the gains, or None."""
         return next((effect for effect in self.effects if isinstance(effect, GainEffect)), None)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _gains_are_effects(cls, data: Any) -> Any:
-        if isinstance(data, Mapping) and "gains" in data:
-            raise fault("gains", f"is now corruption.effects, a list: effects: {_as_effects(data['gains'])}")
-        return data
-
     @model_validator(mode="after")
     def _effects_are_independent(self) -> CorruptionSettings:
         seen: dict[Any, int] = {}
@@ -63,13 +55,3 @@ class CorruptionSettings(Section):
                     )
                 seen[identity] = place
         return self
-
-
-def _as_effects(gains: Any) -> str:
-    """Return a block of the former field `corruption.gains` written as a list of effects."""
-    block = {"kind": gains} if isinstance(gains, str) else dict(gains) if isinstance(gains, Mapping) else {}
-    kind = block.pop("kind", "per-channel")
-    if kind == "unity":
-        return "[]"
-    settings = "".join(f", {name}: {value}" for name, value in block.items())
-    return f"[{{kind: {kind}-gains{settings}}}]"

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import types
 from collections.abc import Iterator
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import nearest
 from calstudy.base.paths import value_at
-from calstudy.base.schema import NESTED
+from calstudy.base.schema import NESTED, alternatives
 
 KINDS = {
     "int_type": "a whole number",
@@ -38,19 +37,10 @@ PREFIXED = ("Hz", "s", "m")
 PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "u", 1e-9: "n"}
 
 
-def _members(annotation: Any) -> list[Any]:
-    """Unpack Annotated and unions into the plain types that they allow."""
-    if get_origin(annotation) is Annotated:
-        return _members(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, types.UnionType):
-        return [member for argument in get_args(annotation) for member in _members(argument)]
-    return [annotation]
-
-
 def _items(annotation: Any) -> list[Any]:
     """Return the types of the items of a block or a list, or nothing for any other type."""
     position = {dict: 1, tuple: 0}.get(get_origin(annotation))
-    return [] if position is None else _members(get_args(annotation)[position])
+    return [] if position is None else alternatives(get_args(annotation)[position])
 
 
 def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, type[BaseModel] | None]:
@@ -64,7 +54,7 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
         path.append(str(step))
         if holder is not None:
             field = holder.model_fields.get(str(step))
-            members = _members(field.annotation) if field else []
+            members = alternatives(field.annotation) if field else []
         else:
             members = _items(members[0]) if members else []
     return ".".join(path), holder

@@ -53,13 +53,6 @@ class Variant(Section):
     effects: bool = Field(False, description="Let the effects of `corruption.effects` happen to the data.")
     calibrate: bool = Field(False, description="Calibrate, and use the residual R.")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _gains_are_effects(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "gains" in data:
-            raise fault("gains", "is now 'effects': true lets all effects of corruption.effects happen to the data")
-        return data
-
     @model_validator(mode="after")
     def _components_are_unique(self) -> Variant:
         if len(set(self.components)) != len(self.components):

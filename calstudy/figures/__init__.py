@@ -13,19 +13,22 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, cast
 
+import numpy as np
+
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import FIGURES, Experiment
+from calstudy.plotting.style import figure_arrays, journal_style, note_stand_ins, save_figure
+from calstudy.products.comparison import Case, read_cases
+from calstudy.products.graph import Graph, required
+from calstudy.products.score import score
+from calstudy.products.spectra import spectra
 from calstudy.run.task import Inputs, Job, Task
 from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
-
-    from calstudy.products.comparison import Case
-    from calstudy.products.graph import Graph
 
 
 TWO_ARRAYS = {"minimally_redundant": "Minimally redundant", "redundant": "Redundant"}
@@ -40,7 +43,7 @@ class Drawing(NamedTuple):
     figure
         From matplotlib.
     shown
-        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.save.figure_arrays`).
+        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.style.figure_arrays`).
     notes
         JSON-able, kept in the record of the product.
     """
@@ -145,8 +148,6 @@ class StudyFigure(Plugin):
         -------
         Tasks by names of the figure's own. If it shows a single product of each member, the name may be empty.
         """
-        from calstudy.products.spectra import spectra
-
         return {"spectra": spectra(graph)} if self.needs_products else {}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
@@ -189,9 +190,6 @@ class CasesFigure(StudyFigure):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the scores of one case."""
-        from calstudy.products.graph import required
-        from calstudy.products.score import score
-
         return {"": required(score(graph))}
 
     @abstractmethod
@@ -208,8 +206,6 @@ class CasesFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Read the scores, and draw them."""
-        from calstudy.products.comparison import read_cases
-
         cases = read_cases(job.settings["calibrators"], job.settings["worlds"], job.inputs)
         shown = {
             world: {name: getattr(case, self.scores) for name, case in found.items()} for world, found in cases.items()
@@ -249,8 +245,6 @@ class Draw(Task, stage="figure", version=4):
         """Draw the figure, with the stand-ins below it; raises InputError if it fails or returns no drawing."""
         from matplotlib.figure import Figure
 
-        from calstudy.plotting.style import journal_style, note_stand_ins
-
         with guarded(self.figure):
             found = self.figure.draw(Job(settings=self.settings, inputs=self.products, output=output))
         if not isinstance(found, Drawing) or not isinstance(found.figure, Figure):
@@ -262,8 +256,6 @@ class Draw(Task, stage="figure", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the figure as png and pdf, and its arrays as npz."""
-        from calstudy.plotting.save import figure_arrays, save_figure
-
         drawing = self.drawing(output)
         try:
             arrays = figure_arrays(drawing.shown)

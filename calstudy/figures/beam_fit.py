@@ -10,7 +10,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin
-from calstudy.base.visibilities import baseline_vectors, from_cube
+from calstudy.base.visibilities import baseline_vectors, from_cube, subset_template
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
@@ -169,7 +169,6 @@ def compare_floors(
 
     Every channel is simulated, so that only the beam is interpolated.
     """
-    from calstudy.base.visibilities import subset_template
     from calstudy.instrument.telescope import make_template
     from calstudy.simulate.chunks import simulate_visibilities
     from calstudy.sky.foregrounds import make_foregrounds

@@ -17,7 +17,7 @@ from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import BAND, LIMIT, SIGMAS, Fault, faults, upper_limit
 from calstudy.run.task import Job
-from calstudy.verdicts.measured import is_measured
+from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

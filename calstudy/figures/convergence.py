@@ -13,7 +13,7 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
 from calstudy.calibrate.agreement import ratio_over_antennas
 from calstudy.calibrate.settings import GainFit, GainWeights
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.products.convergence import PATHS, followed
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.experiment.model import Experiment
 
-SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
 LOWEST = 1e-3
 TOTAL = r"$P^{R}/P^{S}$, EoR in the data"
@@ -65,7 +63,7 @@ def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[in
         raise ValueError("a figure of convergence has no solver, expected at least one")
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2)
-    for path, (marker, colour) in zip(paths, SERIES, strict=False):
+    for path, (marker, colour) in zip(paths, style.SERIES, strict=False):
         _draw_bias(left, path, marker, colour)
         right.errorbar(
             path.steps,

@@ -10,6 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.gains import find_gain_errors
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, rows_of, to_cube
+from calstudy.calibrate.basis import channel_grid
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
@@ -229,8 +231,6 @@ def diagnose(
     `data` are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its result. `errors` are of |g|
     and of the phase of its gains, (2, Nants, Nfreqs, Ntimes, Npols).
     """
-    from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, rows_of, to_cube
-    from calstudy.calibrate.basis import channel_grid
     from calstudy.realdata.quality import assess
 
     model = result.model

@@ -11,11 +11,11 @@ import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
-from calstudy.calibrate.gain_coverage import EXPECTED, GainCoverage
+from calstudy.calibrate.agreement import EXPECTED, GainCoverage
 from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.plotting import style
 from calstudy.products.corruption import PARITIES
-from calstudy.products.gain_coverage import gain_coverage, read_coverage
+from calstudy.products.gain_errors import gain_coverage, read_coverage
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, Fixed, Rules

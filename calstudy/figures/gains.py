@@ -10,7 +10,7 @@ import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.plotting.domains import TwoDomains, delay_panel, frequency_and_delay, in_two_domains
+from calstudy.plotting.axes import TwoDomains, delay_panel, frequency_and_delay, in_two_domains
 from calstudy.products import calibration, corruption
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
@@ -196,7 +196,7 @@ class Gains(StudyFigure):
 def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6) -> Figure:
     """Draw the amplitude of the transform of every antenna's gain, and their median, in one column.
 
-    Gains are (Nants, Nfreqs), see `calstudy.plotting.domains.in_two_domains`. Delays from -max_delay / 4 to max_delay
+    Gains are (Nants, Nfreqs), see `calstudy.plotting.axes.in_two_domains`. Delays from -max_delay / 4 to max_delay
     (s) are shown: Eq. REFGAIN has its peaks at positive delays.
     """
     amplitude = np.abs(gains.transform)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
+from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Layout as LayoutSettings
 from calstudy.plotting import style
 from calstudy.run.task import Job
@@ -82,8 +83,6 @@ def _square_limits(east_north: np.ndarray) -> tuple[np.ndarray, float]:
 
 def layout_panel(layout: LayoutSettings, title: str | None = None) -> LayoutPanel:
     """Return a layout as a panel, under its own name unless another title is given."""
-    from calstudy.instrument.layouts import make_layout
-
     made = make_layout(layout)
     return LayoutPanel(title=title or made.name, numbers=made.numbers, enu=made.enu)
 

@@ -14,11 +14,13 @@ from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.figures.spherical import Marking, draw_points
 from calstudy.figures.wedge import draw_panels
 from calstudy.plotting import style
+from calstudy.power.expected import ExpectedBins
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
+from calstudy.power.transfer import TransferFunction, TransferMap
 from calstudy.products.files import EXPECTED, spectrum_file
 from calstudy.products.files import TRANSFER as FILE
-from calstudy.products.graph import required
+from calstudy.products.graph import MeasuredGraph, required
 from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra
 from calstudy.run.task import Job, Task
@@ -27,10 +29,6 @@ from calstudy.verdicts.tolerances import Drawn, half
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from calstudy.power.expected import ExpectedBins
-    from calstudy.power.transfer import TransferFunction, TransferMap
-    from calstudy.products.graph import MeasuredGraph
 
 
 MARKINGS = {
@@ -205,9 +203,6 @@ class ObservedSignalLoss(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw T per k and per (|b|, tau)."""
-        from calstudy.power.expected import ExpectedBins
-        from calstudy.power.transfer import TransferFunction, TransferMap
-
         folder, prediction = job.inputs["transfer"], None
         if "expected" in job.inputs:
             prediction = load_spectrum(job.inputs["expected"] / EXPECTED, ExpectedBins)

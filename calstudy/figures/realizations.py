@@ -17,8 +17,10 @@ from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure, members_of
 from calstudy.figures.signal_loss import TRANSFER
 from calstudy.plotting import style
 from calstudy.power.realizations import Design, Pooled, PooledRegion, mean_over_bins, pool_region, together
+from calstudy.power.tables import write_columns
 from calstudy.products import realizations
 from calstudy.products.graph import Graph
+from calstudy.products.realizations import RegionResults, read_results
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Arrays, Drawn, Fixed, Measured
 
@@ -26,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.products.realizations import RegionResults
 
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
 CORRELATION_COLOURS = "RdBu_r"
@@ -193,8 +194,6 @@ class Realizations(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Pool all realizations, and draw them."""
-        from calstudy.products.realizations import read_results
-
         results = read_results(job.settings, job.inputs)
         blocks = job.settings["blocks"]
         names = [f"{described(block['draw'])} ({len(block['members'])})" for block in blocks]
@@ -305,8 +304,6 @@ def _differences(first: PooledRegion, second: PooledRegion) -> dict[str, Pooled]
 
 
 def _write(path: Path, regions: Mapping[str, PooledRegion], differences: Mapping[str, Pooled]) -> None:
-    from calstudy.power.tables import write_columns
-
     first = next(iter(regions.values()))
     columns = {"k [h/Mpc]": first.k, "k from [h/Mpc]": first.bin_edges[:-1], "k to [h/Mpc]": first.bin_edges[1:]}
     for name, difference in differences.items():

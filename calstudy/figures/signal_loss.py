@@ -12,7 +12,7 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.plotting.axes import cells, delay_axis, draw_horizon, label_axes
 from calstudy.products import expected_loss, signal_loss
 from calstudy.products.graph import Graph, required
 from calstudy.results.reader import Tables

@@ -16,6 +16,7 @@ from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.cosmology import redshift
 from calstudy.power.limits import WITHIN, Limits, limits_near, published_limits, read_limits
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
@@ -249,8 +250,6 @@ SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eo
 
 def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
     """Read the spherical spectra of all series of a product of stage `spectra`, for "all-modes" or "outside-wedge"."""
-    from calstudy.results.reader import Tables
-
     tables = Tables((folder,))
     series = {name: tables.spherical(name, modes) for name in tables.variants if name in SERIES}
     return SphericalColumn(title=title, **series)

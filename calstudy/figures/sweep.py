@@ -16,18 +16,17 @@ from calstudy.experiment.files import short_names
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER
 from calstudy.plotting import style
+from calstudy.power.transfer import TransferFunction, pool
 from calstudy.products import signal_loss
 from calstudy.products.graph import Graph, required
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.power.transfer import TransferFunction
 
-SERIES = (("o", style.BLUE), ("s", style.ORANGE), ("D", style.GREEN), ("^", style.MAGENTA), ("v", style.RED))
-"""Marker and colour of each band of k, from small k up."""
 SKIES = "sky.eor.seed"
 """The field whose values are further samples of the same EoR, to be pooled."""
 COLUMNS = 2
@@ -91,7 +90,7 @@ def _lowest(panel: SweepPanel) -> float:
 def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
     bands = panel.transfers[0].k.size
     positions = np.arange(len(panel.values))
-    for band, (marker, colour) in enumerate(SERIES[:bands]):
+    for band, (marker, colour) in enumerate(style.SERIES[:bands]):
         values = np.array([item.transfer[band] for item in panel.transfers])
         errors = np.array([item.transfer_error[band] for item in panel.transfers])
         known = np.isfinite(values)
@@ -132,7 +131,7 @@ def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> 
     labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
     handles: list[Any] = [
         axes.errorbar([], [], yerr=[], fmt=marker, color=colour, elinewidth=0.7)
-        for (marker, colour), _ in zip(SERIES, labels, strict=False)
+        for (marker, colour), _ in zip(style.SERIES, labels, strict=False)
     ]
     labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
     handles.append(Line2D([], [], color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
@@ -159,15 +158,11 @@ class Sweep(StudyFigure):
 
 
 def _bands(folder: Path) -> TransferFunction:
-    from calstudy.results.reader import Tables
-
     return Tables((folder,)).transfer_in_bands("outside-wedge")
 
 
 def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:
     """Return one block as a panel: a category per combination of values, with its EoR skies pooled."""
-    from calstudy.power.transfer import pool
-
     fields = list(block[0]["changes"])
     varied = [field for field in fields if len({point["changes"][field] for point in block}) > 1] or fields[:1]
     shown = [field for field in varied if field != SKIES] or varied

@@ -10,7 +10,8 @@ import numpy as np
 
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.plotting.cylinder import cells, delay_axis, draw_horizon, label_axes
+from calstudy.plotting.axes import cells, delay_axis, draw_horizon, label_axes
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, cylindrical_error
 
@@ -170,8 +171,6 @@ class Wedge(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each variant."""
-        from calstudy.results.reader import Tables
-
         tables = Tables((job.inputs["spectra"],))
         panels = WedgePanels(**{name: tables.wedge(name) for name in self.variants})
         figure = draw_wedge(panels, buffer=job.settings["wedge_buffer"])

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from pyuvdata import UVBeam
+from pyuvdata import UVBeam, UVData
 from pyuvdata.analytic_beam import AnalyticBeam, UnpolarizedAnalyticBeam
 from scipy.ndimage import spline_filter1d
 from scipy.spatial.transform import Rotation
@@ -21,14 +21,8 @@ from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beam_grid import bspline_coefficients, cells, fixed_components, polar_components, spline_fields
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams, Beam, model_of
-from calstudy.instrument.settings import AssignedBeam, assigned_beams, nominal_beams
+from calstudy.instrument.settings import AssignedBeam, InstrumentSettings, assigned_beams, nominal_beams
 from calstudy.instrument.tabulated import describe, tabulate
-
-if TYPE_CHECKING:
-    from pyuvdata import UVData
-
-    from calstudy.instrument.settings import InstrumentSettings
-
 
 Source = TypeVar("Source")
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pyuvdata import UVBeam
 from pyuvdata.analytic_beam import AnalyticBeam
-from scipy.constants import speed_of_light
 from scipy.interpolate import CubicSpline
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
@@ -47,7 +47,7 @@ class MwaTile(AnalyticBeam):
 
     def _efield_eval(self, *, az_grid: np.ndarray, za_grid: np.ndarray, f_grid: np.ndarray) -> np.ndarray:
         """Return Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
-        wavenumber = 2 * np.pi * f_grid / speed_of_light
+        wavenumber = 2 * np.pi * f_grid / SPEED_OF_LIGHT
         east = np.sin(za_grid) * np.cos(az_grid)
         north = np.sin(za_grid) * np.sin(az_grid)
         screen = np.sin(wavenumber * TILE_HEIGHT * np.cos(za_grid)) / np.sin(wavenumber * TILE_HEIGHT)

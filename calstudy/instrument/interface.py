@@ -6,13 +6,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
+import numpy as np
 from pydantic import Field
 
 from calstudy.base.plugins import Plugin
 from calstudy.instrument.settings import BEAMS, Channels
 
 if TYPE_CHECKING:
-    import numpy as np
     from pyuvdata import UVBeam
     from pyuvdata.analytic_beam import AnalyticBeam
 

@@ -10,9 +10,8 @@ import numpy as np
 from astropy.time import Time
 from pyuvdata import UVData
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.visibilities import positions, require_rectangular, use_bundled_earth_orientation
-
-SECONDS_PER_DAY = 86400.0
 
 
 def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:

@@ -1,13 +1,168 @@
-"""Averages of delay spectra in bins: spherical (paper Figs. SPHERICAL*), and cylindrical (paper Fig. WEDGE)."""
+r"""Averages of delay spectra in bins, with their error bars.
+
+Averages are spherical (paper Figs. SPHERICAL*) and cylindrical (paper Fig. WEDGE). Errors are those of the paper
+(§Reduction: sigma_P^2 = (sigma_N + sigma_S)^2).
+
+One mode (one baseline, one delay) of even times odd has, for Gaussian sky of power P_S and noise of power P_N,
+
+    var Re(E* O) = P_S^2 + P_S P_N + P_N^2 / 2,
+
+that is sigma_S = P_S without noise and sigma_N = P_N / sqrt(2), the rms of a noise-only spectrum, without signal. The
+paper's sum is exact in both limits and conservative in between (sqrt(2) P_S P_N in place of P_S P_N).
+
+Averages have fewer independent modes than modes:
+
+- a taper correlates neighbouring delays (`calstudy.power.delay.mode_correlation`); tau and -tau are independent;
+- the n (n-1) products of different baselines of a redundant group have independent noise and the same signal:
+  sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same holds for two polarizations. The product of signal and
+  noise contains the noise of n baselines, and its variance falls by n;
+- the signal of two baselines closer than the size of an antenna is partly the same. For a Gaussian beam with squared
+  integral Omega_pp the visibilities correlate by exp(-pi Omega_pp |db|^2 / lambda^2), powers by its square;
+- powers of several times have independent noise. Their signal is partly the same as long as the beams overlap:
+  visibilities of a zenith that moved by theta correlate by exp(-pi theta^2 / (4 Omega_pp)), powers by its square.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
-from calstudy.power.delay import horizon_delay
-from calstudy.power.errors import cross_modes, noise_modes, sample_modes
+from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, outside_wedge
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, bins_of_k, outside_wedge
+
+NEGLIGIBLE = 1e-3
+"""Correlations of powers below this are taken as zero."""
+
+
+def noise_level(noise: DelaySpectra) -> float:
+    """Return sigma_N of a single product of two baselines, in the unit of ``noise.power``, from spectra of noise only.
+
+    It is the rms over all units and delays of the real part, scaled up by the number of products averaged in each unit.
+    The noise must be white and alike on all baselines, as in the paper's simulations.
+    """
+    products = noise.n_pairs * noise.n_polarizations * noise.n_times
+    return float(np.sqrt(np.mean(products[:, None] * noise.power.real**2)))
+
+
+def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return the number of independent products of noise in each bin, (n_bins,) float, zero for empty bins.
+
+    sigma_N falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
+    """
+    return _modes_of_noise(spectra, bins, n_bins, spectra.n_pairs)
+
+
+def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.ndarray) -> np.ndarray:
+    """Return sigma_N of each bin where the units differ in their noise, (n_bins,); NaN for empty bins.
+
+    `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out. `noise`, (Nu,), is P_N of a single product
+    of each unit, whose real part has the variance P_N^2 / 2.
+    """
+    with np.errstate(divide="ignore"):
+        independent = spectra.n_pairs / (noise**2 / 2)
+        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan) / np.sqrt(
+            _modes_of_noise(spectra, bins, n_bins, independent)
+        )
+
+
+def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return the number of independent products of signal and noise in each bin; parameters as in `noise_modes`."""
+    return _modes_of_noise(spectra, bins, n_bins, spectra.n_baselines)
+
+
+def _modes_of_noise(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
+    """Return the effective modes where a unit averages `independent` samples of each polarization, (Nu,)."""
+    units = np.arange(len(spectra.n_pairs))
+    samples = independent * spectra.n_polarizations * spectra.n_times
+    return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / samples))
+
+
+def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return the number of independent modes of the signal in each bin, (n_bins,) float, zero for empty bins.
+
+    sigma_S falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
+    """
+    first, second, correlation = _signal_correlation(spectra)
+    return _effective_modes(spectra, bins, n_bins, (first, second, correlation)) * spectra.independent_times
+
+
+def independent_times(sidereal_times: np.ndarray, latitude: float, omega_pp: float) -> float:
+    """Return the number of independent skies that an antenna pointing to the zenith sees at n sidereal times (rad).
+
+    It is n^2 over the sum of the correlations of the powers of all times with each other. The latitude is in rad; the
+    beam is taken as Gaussian, with the integral of its square `omega_pp` in sr.
+    """
+    apart = sidereal_times[:, None] - sidereal_times
+    moved = 2 * np.arcsin(np.cos(latitude) * np.abs(np.sin(apart / 2)))
+    return float(sidereal_times.size**2 / np.exp(-np.pi * moved**2 / (2 * omega_pp)).sum())
+
+
+def with_errors(
+    spectrum: SphericalSpectrum, noise: float = 0.0, signal: SphericalSpectrum | None = None
+) -> SphericalSpectrum:
+    """Return `spectrum` with its error bars, sigma_P = sigma_N + sigma_S in each bin.
+
+    `noise` is sigma_N of a single product, from `noise_level`; zero for spectra of the signal only. `signal` is the
+    spectrum of the signal only in the same bins, whose real part is the sample standard deviation of one mode; None for
+    spectra of noise only. Raise ValueError if the bins differ.
+    """
+    if signal is not None and not np.array_equal(signal.bin_edges, spectrum.bin_edges):
+        raise ValueError("the signal's spectrum has other bins than the spectrum that needs errors, expected the same")
+    amplitude = np.zeros(spectrum.k.size) if signal is None else np.abs(signal.power.real)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        noise_error = np.where(spectrum.n_modes > 0, noise / np.sqrt(spectrum.noise_modes), np.nan)
+        sample_error = np.where(spectrum.n_modes > 0, amplitude / np.sqrt(spectrum.sample_modes), np.nan)
+    return dataclasses.replace(spectrum, noise_error=noise_error, sample_error=sample_error)
+
+
+def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
+    from scipy.spatial import cKDTree
+
+    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / SPEED_OF_LIGHT) ** 2
+    reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
+    tree = cKDTree(spectra.vectors)
+    units = np.arange(len(spectra.vectors))
+    # V(-b) is the conjugate of V(b), its powers those at -tau: the same |k|.
+    close = [tree.query_pairs(reach, output_type="ndarray")]
+    opposite = tree.query_ball_point(-spectra.vectors, reach)
+    close.append(np.array([(i, j) for i, found in enumerate(opposite) for j in found if i < j]).reshape(-1, 2))
+    pairs = np.unique(np.concatenate(close).astype(int), axis=0)
+    first, second = pairs.T
+    distance = np.minimum(
+        np.linalg.norm(spectra.vectors[first] - spectra.vectors[second], axis=1),
+        np.linalg.norm(spectra.vectors[first] + spectra.vectors[second], axis=1),
+    )
+    correlation = np.exp(-rate * distance**2)
+    return (
+        np.concatenate([units, first, second]),
+        np.concatenate([units, second, first]),
+        np.concatenate([np.ones(units.size), correlation, correlation]),
+    )
+
+
+def _effective_modes(
+    spectra: DelaySpectra, bins: np.ndarray, n_bins: int, covariance: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return (sum w)^2 / sum_ij w_i w_j C_ij over modes i, j of each bin: w number of pairs, C units times delays."""
+    first, second, between_units = covariance
+    weights = spectra.n_pairs.astype(float)
+    between_units = between_units * weights[first] * weights[second]
+    between_delays = mode_correlation(spectra.taper, spectra.delay.size)
+    variance = np.zeros(n_bins)
+    for lag in np.flatnonzero(between_delays > NEGLIGIBLE):
+        shifted = np.roll(bins, -lag, axis=1)
+        shared = (bins[first] == shifted[second]) & (bins[first] >= 0)
+        # Both signs of the lag: the list of units has each pair in both orders.
+        both = 1.0 if lag == 0 else 2.0
+        values = np.broadcast_to((both * between_delays[lag] * between_units)[:, None], shared.shape)[shared]
+        variance += np.bincount(bins[first][shared], values, minlength=n_bins)
+    used = bins >= 0
+    total = np.bincount(bins[used], np.broadcast_to(weights[:, None], bins.shape)[used], minlength=n_bins)
+    return np.divide(total**2, variance, out=np.zeros(n_bins), where=variance > 0)
 
 
 def make_bin_edges(bins: KBins) -> np.ndarray:
@@ -20,10 +175,7 @@ def modes_in_bins(
     spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
 ) -> np.ndarray:
     """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those left out; parameters as in `spherical_average`."""
-    edges = make_bin_edges(settings.bins)
-    magnitude = np.hypot(spectra.k_perp[:, None], spectra.k_parallel)
-    bins = np.searchsorted(edges, magnitude, side="left") - 1
-    bins[(bins < 0) | (bins >= edges.size - 1)] = -1
+    bins = bins_of_k(spectra, make_bin_edges(settings.bins))
     if exclude_wedge:
         bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
     if only_wedge:

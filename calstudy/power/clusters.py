@@ -27,15 +27,10 @@ fixed by the number of unknowns, which does not appear in any scatter.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.power.spectra import outside_wedge
-
-if TYPE_CHECKING:
-    from calstudy.power.spectra import DelaySpectra
-
+from calstudy.power.spectra import DelaySpectra, bins_of_k, outside_wedge
 
 LARGEST_PART = 0.5
 """Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""
@@ -194,10 +189,9 @@ def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
 def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
     """Return the clusters of the modes in bins of |k|, outside or inside the wedge; each unit is a sample.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. Modes with
-    |tau| <= |b|/c + `buffer` (s) are inside the wedge.
+    `edges` are as in `calstudy.power.spectra.bins_of_k`. Modes with |tau| <= |b|/c + `buffer` (s) are inside the wedge.
     """
-    bins = np.searchsorted(edges, np.hypot(spectra.k_perp[:, None], spectra.k_parallel), side="left") - 1
-    bins[(bins >= edges.size - 1) | (outside_wedge(spectra, buffer) == inside)] = -1
+    bins = bins_of_k(spectra, edges)
+    bins[outside_wedge(spectra, buffer) == inside] = -1
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
     return Clusters.of(spectra, bins, samples, edges.size - 1)

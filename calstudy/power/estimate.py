@@ -18,11 +18,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from astropy import constants
 from hera_pspec import PSpecData, UVPSpec
 from hera_pspec.pspecbeam import PSpecBeamFromArray
 from pyuvdata import UVData, utils
 
+from calstudy.base.constants import BOLTZMANN, SPEED_OF_LIGHT
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
@@ -209,8 +209,8 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
     halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
     if pol_convention not in halves:
         raise ValueError(f"pol_convention {pol_convention!r} is unknown, allowed: None, 'sum', 'avg'")
-    wavelength = constants.c.value / frequencies
-    return halves[pol_convention] * 1e-26 * wavelength**2 / (2 * constants.k_B.value * omega_p)
+    wavelength = SPEED_OF_LIGHT / frequencies
+    return halves[pol_convention] * 1e-26 * wavelength**2 / (2 * BOLTZMANN * omega_p)
 
 
 @lru_cache(maxsize=4)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calstudy.power.spectra import BaselineModes, outside_wedge
+from calstudy.power.spectra import BaselineModes, bins_of_k, outside_wedge
 
 
 @dataclass(frozen=True)
@@ -96,5 +96,5 @@ def bin_response(
 
 def bins_outside(modes: BaselineModes, limits: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the bin of |k| of each mode, and a mask of the modes that are in a bin and outside the wedge."""
-    bins = np.searchsorted(limits, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
-    return bins, outside_wedge(modes, buffer) & (bins >= 0) & (bins < limits.size - 1)
+    bins = bins_of_k(modes, limits)
+    return bins, outside_wedge(modes, buffer) & (bins >= 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
 import numpy as np
@@ -10,12 +11,12 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
+from calstudy.power.binned import independent_times
+from calstudy.power.delay import TAPERS
 from calstudy.power.settings import ESTIMATORS, PowerSettings
 from calstudy.power.spectra import DelaySpectra, average_times
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVData
 
 
@@ -74,8 +75,6 @@ def estimate_spectra(
         If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, or if even and odd
         data have different numbers of integrations.
     """
-    from calstudy.power.errors import independent_times
-
     estimator = cast(Estimator, settings.estimator)
     found = []
     blocks = _blocks(even, odd)
@@ -133,8 +132,6 @@ def _integration(uvd: UVData, number: int) -> UVData:
 
 def _fault(found: object) -> str | None:
     """Return the fault of the result of an estimator, or None."""
-    from calstudy.power.delay import TAPERS
-
     if not isinstance(found, DelaySpectra):
         return f"returned a {type(found).__name__}, expected DelaySpectra"
     units, n_delays = len(found.n_pairs), len(found.delay)

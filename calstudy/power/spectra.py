@@ -47,7 +47,7 @@ class DelaySpectra:
         from the scatter of units, which is too small where units share antennas.
     n_times, independent_times
         Number of times whose powers are averaged, each with its own noise, and number of independent skies that they
-        see, at most as many (`calstudy.power.errors.independent_times`).
+        see, at most as many (`calstudy.power.binned.independent_times`).
     """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
@@ -152,9 +152,9 @@ class SphericalSpectrum:
     n_modes : modes (baseline or redundant group, and delay) averaged, (Nk,) int
     noise_modes, sample_modes, cross_modes
         Independent modes of noise, of signal, and of the product of both among them, (Nk,); see
-        `calstudy.power.errors`.
+        `calstudy.power.binned`.
     noise_error, sample_error
-        Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.errors.with_errors`.
+        Standard deviations by noise and by sample variance, (Nk,); NaN until `calstudy.power.binned.with_errors`.
     wedge_excluded : true if modes inside the wedge were left out
     """
 
@@ -178,7 +178,7 @@ class SphericalSpectrum:
     def difference_error(self) -> np.ndarray:
         """Standard deviation of P - P_S, (Nk,), where the EoR that P contains is the one whose power is P_S.
 
-        Both contain the sample variance of a mode (`calstudy.power.errors`). The noise remains, and the product of
+        Both contain the sample variance of a mode (`calstudy.power.binned`). The noise remains, and the product of
         signal and noise.
         """
         noise, sample = self.noise_error, self.sample_error
@@ -191,6 +191,16 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
     """Return which modes lie outside the wedge: |tau| > |b|/c + `buffer` (s), shape (Nu, Nd) bool."""
     horizon = horizon_delay(modes.length)
     return np.abs(modes.delay) > horizon[:, None] + buffer
+
+
+def bins_of_k(modes: DelaySpectra | BaselineModes, edges: np.ndarray) -> np.ndarray:
+    """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those in none.
+
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge.
+    """
+    bins = np.searchsorted(edges, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
+    bins[bins >= edges.size - 1] = -1
+    return bins
 
 
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:

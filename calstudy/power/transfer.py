@@ -69,14 +69,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calstudy.power.clusters import Clusters, clusters_in_k, linear_error
+from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.verdicts.measured import is_measured
+from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
-    from calstudy.power.clusters import Sums
     from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 
 

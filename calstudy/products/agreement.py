@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.instrument.layouts import size_of_instrument
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
+from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
+from calstudy.instrument.layouts import redundant_groups, size_of_instrument
 from calstudy.instrument.settings import Size
 from calstudy.products import calibration, corruption, simulation
 from calstudy.products.files import AGREEMENT, DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
 
 MOST_SAMPLES = 112 * 630 * 384
 """Maximum number of visibilities compared, twice the paper's: it limits the memory."""
@@ -75,12 +76,6 @@ class Agreement(Task, stage="agreement", version=3):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write measurements of the first polarization and the redundant fraction of the array to agreement.json."""
-        import numpy as np
-
-        from calstudy.base.errors import InputError
-        from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube
-        from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth
-        from calstudy.instrument.layouts import redundant_groups
         from calstudy.products.selection import read_gains
 
         data = read_visibilities(self.data / DATA)
@@ -141,6 +136,4 @@ def integrations_compared(size: Size) -> int:
 
 def spread(places: np.ndarray, most: int) -> np.ndarray:
     """Return places, (N,), or `most` of them at equal distances from the first to the last if there are more."""
-    import numpy as np
-
     return places[np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))]

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of, run_calibrator
 from calstudy.calibrate.interface import Assumed, Calibrator
 from calstudy.calibrate.records import SETTLED, CalibrationResult, Solve
+from calstudy.calibrate.sky_model import common_baselines
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
 from calstudy.products.corruption import LEVELS
@@ -31,9 +35,6 @@ from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
     from pyuvdata import UVData
 
     from calstudy.calibrate.preparation import PreparedFit
@@ -85,8 +86,6 @@ def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.nda
 
     A run ends at the end of a group of integrations that are solved `together`.
     """
-    import numpy as np
-
     times = integration_times(path)
     together = min(together, times.size)
     groups = -(-times.size // together)
@@ -96,8 +95,6 @@ def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.nda
 
 def with_autocorrelations(data: UVData, autos: UVData) -> UVData:
     """Return data with the autocorrelations of each integration after all other baselines."""
-    import numpy as np
-
     joined = data.fast_concat([autos], "blt", inplace=False)
     rows = [np.arange(uvd.Nblts).reshape(uvd.Ntimes, uvd.Nbls) for uvd in (data, autos)]
     joined.reorder_blts(order=np.hstack([rows[0], data.Nblts + rows[1]]).ravel(), run_check=False)
@@ -135,8 +132,6 @@ class Calibrated(Task):
 
     def read(self, times: np.ndarray | None = None) -> tuple[UVData, UVData | None, float | None]:
         """Read data, sky model and noise level at some integrations (JD), by default all; None for what is lacking."""
-        from calstudy.calibrate.sky_model import common_baselines
-
         data = read_visibilities(self.data / DATA, times)
         sky = None if self.sky_model is None else read_visibilities(self.sky_model / VISIBILITIES, times)
         if self.autocorrelations is not None:
@@ -185,7 +180,6 @@ class Calibrate(Task, stage="calibrate", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Join the runs of integrations into one set of gains, model, residual and records of solves."""
-        import numpy as np
         from pyuvdata import UVCal
 
         gains = UVCal.from_file([str(folder / GAINS) for folder in self.chunk], axis="time")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,16 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score, difference
+from calstudy.power.tables import load_spectrum
 from calstudy.products import spectra
-from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, json_number, read_json
+from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, read_json
 from calstudy.products.graph import size_of
 from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
 from calstudy.run.task import Inputs, Task
-from calstudy.verdicts.measured import is_measured, marked
-from calstudy.verdicts.standing import advice, standing_table, standings
+from calstudy.verdicts.standing import advice, is_measured, marked, standing_table, standings
 
 CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
@@ -83,8 +85,6 @@ def read_cases(
 
 
 def _read(folder: Path) -> Case:
-    from calstudy.power.tables import load_spectrum
-
     bins, bands = (load_spectrum(folder / name, Score) for name in (SCORE_BINS, SCORE_BANDS))
     return Case(bins, bands, read_json(folder / SCORE))
 
@@ -120,8 +120,6 @@ class Comparison(Task, stage="comparison", version=6):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write comparison.csv, comparison.json and comparison.md."""
-        import json
-
         cases = read_cases(self.calibrators, self.worlds, self.cases)
         less = {world: self.differences(world, found) for world, found in cases.items()}
         Table.of_records(list(_csv_rows(cases))).write_csv(output / CSV)

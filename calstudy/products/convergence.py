@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calstudy.base.errors import InputError
+from calstudy.base.observation import Observation
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.agreement import Baselines, Realization, cross_power
 from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES
+from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.problem import gain_products
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
@@ -18,10 +24,6 @@ from calstudy.products.graph import Graph, size_of
 from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
     from calstudy.calibrate.settings import Solver
     from calstudy.calibrate.solvers.interface import Checkpoint
 
@@ -69,8 +71,6 @@ class Convergence(Task, stage="convergence", version=4):
 
         Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
         """
-        import numpy as np
-
         paths, realizations = {}, {}
         for parity in PARITIES:
             realizations[parity], paths[parity], baselines = self._solved(parity)
@@ -103,17 +103,11 @@ class Convergence(Task, stage="convergence", version=4):
 
     def _integration(self, folder: Path) -> np.ndarray:
         """Return one integration of the first polarization of data, (Nbls, Nfreqs)."""
-        from calstudy.base.visibilities import to_cube
-
         return to_cube(read_visibilities(folder / DATA))[self.integration, ..., 0]
 
     def _solved(self, parity: str) -> tuple[Realization, list[Checkpoint], Baselines]:
         """Return a realization, the states of the solver after the numbers of steps, and the baselines."""
-        import numpy as np
-
-        from calstudy.base.observation import Observation
         from calstudy.calibrate.calamity import make_solver
-        from calstudy.calibrate.interface import Assumed
         from calstudy.calibrate.preparation import make_problem, prepare
         from calstudy.calibrate.solvers.interface import trace
         from calstudy.products.selection import read_gains

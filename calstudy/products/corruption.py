@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import make_uvcal
@@ -12,7 +15,9 @@ from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, positions, to_cube
 from calstudy.corrupt.interface import Effect, GainEffect, apply_effect, draw_flags, draw_truth
-from calstudy.corrupt.noise import NoNoise, RadiometerNoise
+from calstudy.corrupt.levels import Levels, radiometer_std, rms, set_levels
+from calstudy.corrupt.noise import NoNoise, RadiometerNoise, thermal_noise
+from calstudy.corrupt.noise import autocorrelations as draw
 from calstudy.experiment.model import Variant
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.settings import InstrumentSettings
@@ -31,10 +36,6 @@ from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
     from calstudy.corrupt.settings import CorruptionSettings
 
 LEVELS, TRUTH = "levels.json", "truth.h5"
@@ -180,8 +181,6 @@ class MultiplyGains(Task, stage="gains", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the gains to gains.calh5."""
-        import numpy as np
-
         from calstudy.instrument.telescope import make_template
 
         template = make_template(self.instrument)
@@ -209,8 +208,6 @@ class MeasureLevels(Task, stage="levels", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scales to levels.json."""
-        from calstudy.corrupt.levels import radiometer_std, rms, set_levels
-
         foregrounds, eor = (
             0.0 if folder is None else rms(to_cube(read_visibilities(folder / VISIBILITIES)))
             for folder in (self.foregrounds, self.eor)
@@ -260,10 +257,6 @@ class Corrupt(Task, stage="corrupt", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the data to data.uvh5."""
-        import numpy as np
-
-        from calstudy.corrupt.levels import Levels, rms
-        from calstudy.corrupt.noise import thermal_noise
         from calstudy.instrument.telescope import make_template
 
         found = Levels(**read_json(self.levels / LEVELS))
@@ -309,10 +302,6 @@ class Autocorrelate(Task, stage="autocorrelations", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the autocorrelations to data.uvh5."""
-        import numpy as np
-
-        from calstudy.corrupt.levels import Levels
-        from calstudy.corrupt.noise import autocorrelations as draw
         from calstudy.instrument.telescope import make_template
 
         template = make_template(self.instrument, autos=True)

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calstudy.base.errors import InputError
+from calstudy.base.files import json_number
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
+from calstudy.calibrate.records import Solve
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
 from calstudy.instrument.layouts import size_of_instrument
+from calstudy.power.binned import make_bin_edges
+from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
+from calstudy.power.score import BANDS
 from calstudy.power.settings import PowerSettings
+from calstudy.power.spectra import BaselineModes
+from calstudy.power.tables import save_spectrum
 from calstudy.products import calibration, corruption
 from calstudy.products.calibration import Calibrated, prepared_fit
 from calstudy.products.files import (
@@ -23,7 +33,6 @@ from calstudy.products.files import (
     MODEL,
     SOLUTION,
     integration_times,
-    json_number,
     read_json,
     read_visibilities,
     write_json,
@@ -32,13 +41,8 @@ from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
     from calstudy.calibrate.expected_loss import ExpectedTransfer
     from calstudy.calibrate.problem import CalibrationProblem
-    from calstudy.power.spectra import BaselineModes
 
 RESPONSE, AMPLITUDES = "linear-response.json", "amplitudes.npz"
 # Random vectors for the stochastic diagonal: its scatter, 6 % of the mode's power over their root, is averaged down
@@ -135,10 +139,7 @@ class Solved(Calibrated):
 
     def solution(self) -> _Solution | None:
         """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
-        import numpy as np
-
         from calstudy.calibrate.preparation import problem_at
-        from calstudy.calibrate.records import Solve
         from calstudy.products.selection import read_gains
 
         data, sky, noise = self.read(self.times)
@@ -180,7 +181,6 @@ class ExpectedLoss(Solved, stage="expected-loss", version=4):
         """Write the expected T in bins of k and of baseline length and delay."""
         from calstudy.calibrate.expected_loss import DelayModes
         from calstudy.calibrate.expected_loss import expected_transfer as expected_of
-        from calstudy.power.tables import save_spectrum
 
         solution = self.solution()
         if solution is None:
@@ -205,8 +205,6 @@ class Response(Solved, stage="response", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the amplitudes of the signal and of what is left of it; none if there are no gains."""
-        import numpy as np
-
         from calstudy.calibrate.expected_loss import DelayModes
         from calstudy.calibrate.expected_loss import linear_response as response_to
 
@@ -246,10 +244,6 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T and C in bands, crossed between the realizations as T by injection is, or null if not known."""
-        import numpy as np
-
-        from calstudy.power.score import BANDS
-
         with (
             np.load(self.even / AMPLITUDES, allow_pickle=False) as even,
             np.load(self.odd / AMPLITUDES, allow_pickle=False) as odd,
@@ -270,9 +264,6 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk
 
 def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
     """Return the modes of baselines (lengths in m) at delays (s), for the centre of the band (Hz)."""
-    from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-    from calstudy.power.spectra import BaselineModes
-
     cosmology = make_cosmology(power.cosmology)
     return BaselineModes(
         length=lengths,
@@ -284,8 +275,6 @@ def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: Power
 
 def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power: PowerSettings) -> ExpectedBins:
     """Return an expected T of baselines (lengths in m, band centre in Hz) in bins of k and of length and delay."""
-    from calstudy.power.binned import make_bin_edges
-
     modes = modes_of(expected.delay, lengths, centre, power)
     edges = make_bin_edges(power.bins)
     return bin_expected(modes, expected.transfer, expected.error, edges, power.wedge_buffer, power.length_bin)

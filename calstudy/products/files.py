@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,6 @@ import numpy as np
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from pyuvdata import UVData
     from pyuvdata.uvdata import FastUVH5Meta
 
@@ -92,11 +89,6 @@ def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
 def read_json(path: Path) -> Any:
     """Read a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def json_number(value: float) -> float | None:
-    """Return a number for JSON: None if it is not finite."""
-    return float(value) if math.isfinite(value) else None
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -13,17 +14,15 @@ from calstudy.corrupt.drift import Correlated
 from calstudy.corrupt.effects.gains import Bandpass
 from calstudy.experiment.model import Variant
 from calstudy.instrument.settings import Channels, Times
+from calstudy.power.gain_bias import FALLEN, ErrorCovariance, GainBias, bias_terms, exponential
 from calstudy.power.score import BANDS
 from calstudy.power.settings import PowerSettings
+from calstudy.power.spectra import of_common_units
+from calstudy.power.tables import load_spectrum, save_spectrum
 from calstudy.products import spectra
 from calstudy.products.graph import Graph, memoize, required, size_of
 from calstudy.products.signal_loss import transfer
 from calstudy.run.task import Input, Task
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from calstudy.power.gain_bias import GainBias
 
 GAIN_BIAS = "gain-bias.h5"
 LENGTHS = 30
@@ -64,10 +63,6 @@ class ExpectGainBias(Task, stage="gain-bias", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the expected bias to gain-bias.h5."""
-        from calstudy.power.gain_bias import FALLEN, ErrorCovariance, GainBias, bias_terms, exponential
-        from calstudy.power.spectra import of_common_units
-        from calstudy.power.tables import save_spectrum
-
         parts = {name: spectra.read_delay_spectra(getattr(self, name)) for name in ("foregrounds", "signal")}
         parts, effect, width = of_common_units(parts), self.effect, self.channels.width
         shape = cast(Correlated, effect.shape)
@@ -107,7 +102,4 @@ class ExpectGainBias(Task, stage="gain-bias", version=1):
 
 def read_gain_bias(folder: Path) -> GainBias:
     """Read a product of the stage `gain-bias`."""
-    from calstudy.power.gain_bias import GainBias
-    from calstudy.power.tables import load_spectrum
-
     return load_spectrum(folder / GAIN_BIAS, GainBias)

@@ -1,28 +1,32 @@
-"""Errors of the gains of a calibration by noise, in its file of gains."""
+"""Errors of the gains of a calibration by noise, in its file of gains, and their coverage of the true gains."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from calstudy.base.errors import InputError
+from calstudy.base.gains import write_gain_errors
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import positions
+from calstudy.base.visibilities import positions, to_cube
+from calstudy.calibrate.agreement import GainCoverage, pulls
+from calstudy.calibrate.gain_errors import MOST_UNKNOWNS, ErrorsInTime, GainErrors
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
-from calstudy.products import calibration, observed
+from calstudy.products import calibration, corruption, observed
 from calstudy.products.calibration import Calibrated, prepared_fit, read_result
 from calstudy.products.files import GAINS, write_json
 from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
-    from calstudy.calibrate.gain_errors import GainErrors
     from calstudy.calibrate.records import CalibrationResult
+
 
 ERRORS = "gain-errors.json"
 """A record for each solve: what its errors mean and how large they are, or `reason`, why there are none."""
@@ -87,10 +91,6 @@ class OfSolves(Calibrated):
 
     def solves(self, result: CalibrationResult) -> Iterator[SolvedGains]:
         """Yield the gains of every solve with their errors."""
-        import numpy as np
-
-        from calstudy.base.visibilities import to_cube
-        from calstudy.calibrate.gain_errors import ErrorsInTime
         from calstudy.calibrate.preparation import problem_at
 
         settings = self.calibrator
@@ -126,8 +126,6 @@ class OfSolves(Calibrated):
             yield SolvedGains(rows, times, place, gains, found)
 
     def _cost(self) -> Cost:
-        from calstudy.calibrate.gain_errors import MOST_UNKNOWNS
-
         size = size_of(self)
         matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
         blocks = size.antennas * (2 * size.channels.count) ** 2 * COMPLEX128 / 2
@@ -140,10 +138,6 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the gains with their errors, and a record for each solve."""
-        import numpy as np
-
-        from calstudy.base.gains import write_gain_errors
-
         result = read_result(self.calibration)
         errors = np.full((2, *result.gains.gain_array.shape), np.nan)
         records: list[dict[str, Any]] = []
@@ -170,8 +164,6 @@ def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> l
     Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The unevenness is the
     largest of all solves.
     """
-    import numpy as np
-
     sizes = np.where(np.isfinite(errors), np.abs(gains), np.nan)
     known = np.isfinite(sizes).any(axis=(1, 2, 3))
     if not known.any():
@@ -184,3 +176,44 @@ def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> l
         f"|g| is up to {largest:.2g} times the median of its antenna, and the median signal to noise of the gains is "
         f"{signal_to_noise:.2g}: noise alone does this; {REMEDY}"
     ]
+
+
+COVERAGE = "gain-coverage.npz"
+
+
+@memoize
+def gain_coverage(graph: Graph, variant: Variant, parity: str) -> Task:
+    """Return the task of the coverage of one noise realization ("even" or "odd") of a variant."""
+    true = corruption.gains(graph) if variant.effects else None
+    return MeasureCoverage(f"coverage {parity}", gains=true, **solved(graph, variant, parity))
+
+
+class MeasureCoverage(OfSolves, stage="gain-coverage", version=3):
+    """Fractions of the gains of each solve that are within their errors of the true gains, unity if there are none."""
+
+    gains: Input = None
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the fractions; raises InputError if no gains have errors."""
+        from calstudy.products.selection import read_gains
+
+        result, found, reasons = read_result(self.calibration), [], []
+        true = None if self.gains is None else read_gains(self.gains)
+        for solve in self.solves(result):
+            if isinstance(solve.errors, str):
+                reasons.append(solve.errors)
+                continue
+            numbers = result.gains.ant_array[solve.rows]
+            reference = np.ones(solve.gains.shape) if true is None else true.at(solve.times.start, numbers)
+            found.append(pulls(solve.errors, solve.gains, reference))
+        if not found:
+            raise InputError(f"no errors of gains: {'; '.join(sorted(set(reasons)))}")
+        np.savez(output / COVERAGE, allow_pickle=False, **asdict(GainCoverage.of(found)))
+        lacking = [f"{len(reasons)} solves have no errors of gains: {'; '.join(sorted(set(reasons)))}"]
+        return {"solves": len(found), "warnings": lacking if reasons else []}
+
+
+def read_coverage(folder: Path) -> GainCoverage:
+    """Read the fractions of all solves."""
+    with np.load(folder / COVERAGE, allow_pickle=False) as arrays:
+        return GainCoverage(**arrays)

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.layouts import size_of_instrument
-from calstudy.instrument.settings import Size
+from calstudy.instrument.settings import Beam, Channels, Size
 from calstudy.run.task import Task
 
 if TYPE_CHECKING:
-    from calstudy.instrument.settings import Beam, Channels
     from calstudy.realdata.halves import Parts
 
 Found = TypeVar("Found")

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calstudy.base.errors import InputError
+from calstudy.base.gains import gain_products
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
+from calstudy.calibrate.sky_model import common_baselines
+from calstudy.corrupt.noise import effective_area
 from calstudy.products.calibration import calibration_of
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import (
@@ -27,16 +33,14 @@ from calstudy.products.files import (
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
 from calstudy.products.spectra import InBlocks, blocks_in, cross_power
 from calstudy.realdata.halves import PARITIES, WHOLE, east_and_north, flag_channels, interleaved
+from calstudy.realdata.interference import flag_interference
+from calstudy.realdata.selection import Selection
 from calstudy.realdata.settings import Factor, FromAutocorrelations, ObservedSettings, Select
 from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
     from pyuvdata import UVData
 
-    from calstudy.realdata.selection import Selection
 
 NOISE = "noise.uvh5"
 """Sigma of an average's noise from the autocorrelations."""
@@ -161,10 +165,7 @@ class Observe(Task, stage="observe", version=2):
 
         Raises InputError if the data or the model cannot be used.
         """
-        from calstudy.calibrate.sky_model import common_baselines
-        from calstudy.realdata.interference import flag_interference
         from calstudy.realdata.reading import place_antennas, read_visibilities
-        from calstudy.realdata.selection import Selection
 
         selection, sky, placed = self.select.selection, None, []
         data = read_visibilities(self.files)
@@ -199,9 +200,6 @@ class Observe(Task, stage="observe", version=2):
 
     def _factor(self, data: UVData) -> float:
         """Return the value of one unit of the data in Jy."""
-        import numpy as np
-
-        from calstudy.corrupt.noise import effective_area
         from calstudy.instrument.beams import make_beam
 
         scale = self.flux_scale
@@ -246,10 +244,8 @@ class ObservedAverage(InBlocks, stage="observed-average", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the average to average.uvh5, and sigma of its noise to noise.uvh5 if there are autocorrelations."""
-        import numpy as np
         from pyuvdata import UVCal
 
-        from calstudy.base.gains import gain_products
         from calstudy.power.average import average_in_blocks
         from calstudy.realdata.noise import noise_of_average
 
@@ -289,16 +285,12 @@ class ObservedAverage(InBlocks, stage="observed-average", version=1):
 
 def crosses_of(data: UVData) -> UVData:
     """Return the cross-correlations of rectangular, time-major data."""
-    import numpy as np
-
     crosses = np.flatnonzero(data.ant_1_array != data.ant_2_array)
     return data.select(blt_inds=crosses, inplace=False, run_check=False)
 
 
 def _variances(data: UVData, pairs: np.ndarray) -> np.ndarray | None:
     """Return sigma^2 of all samples from the autocorrelations, (Ntimes, Nbls, Nfreqs, Npols), or None without them."""
-    import numpy as np
-
     from calstudy.realdata.noise import radiometer_variance
 
     found = [radiometer_variance(data, pairs, polarization) for polarization in range(data.Npols)]
@@ -315,8 +307,6 @@ class ObservedNoise(Task, stage="observed-noise", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the visibilities to average.uvh5."""
-        import numpy as np
-
         from calstudy.realdata.noise import half_difference
 
         if self.source == "difference":

@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from calstudy.base.errors import InputError
+from calstudy.base.gains import gain_products
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, positions, rows_of, to_cube
+from calstudy.base.visibilities import (
+    antenna_pairs,
+    baseline_vectors,
+    from_cube,
+    positions,
+    rows_of,
+    subset_template,
+    to_cube,
+)
 from calstudy.calibrate.settings import GainFit
+from calstudy.instrument.interface import model_of
+from calstudy.power.binned import spherical_average, with_errors
+from calstudy.power.cosmology import make_cosmology
+from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
 from calstudy.products.expected_loss import LABEL, NOT_OF_THE_FIT, PROBES, binned
@@ -35,11 +51,9 @@ from calstudy.products.table import StudyTable
 from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Task, called
 from calstudy.simulate.interface import SimulationSize
-from calstudy.verdicts.measured import HIGHEST, LARGEST_ERROR, LOWEST
+from calstudy.verdicts.standing import HIGHEST, LARGEST_ERROR, LOWEST
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVData
 
     from calstudy.calibrate.expected_loss import ExpectedTransfer
@@ -151,12 +165,7 @@ class SimulateEor(Task, stage="observed-eor", version=3):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the EoR to visibilities.uvh5."""
-        import numpy as np
-
-        from calstudy.base.visibilities import subset_template
         from calstudy.instrument.beams import make_beam
-        from calstudy.instrument.interface import model_of
-        from calstudy.power.cosmology import make_cosmology
         from calstudy.simulate.chunks import assemble, plan_chunks, simulate_chunk
         from calstudy.sky.eor import EorField
 
@@ -197,8 +206,6 @@ class SetLevel(Task, stage="observed-level", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the factor to factor.json."""
-        import numpy as np
-
         found = 1.0
         sky = read_visibilities(self.eor / VISIBILITIES).data_array
         if self.level is not None:
@@ -238,10 +245,7 @@ class Inject(Added, stage="inject", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the data to data.uvh5."""
-        import numpy as np
         from pyuvdata import UVCal
-
-        from calstudy.base.gains import gain_products
 
         data, sky = read_visibilities(self.data / DATA), self.signal()
         pairs = antenna_pairs(sky)
@@ -276,10 +280,6 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T, spectra of the injected EoR, and the power of the residual corrected by T."""
-        from calstudy.power.binned import spherical_average
-        from calstudy.power.errors import with_errors
-        from calstudy.power.spectra import SphericalSpectrum
-
         found = self.read()
         # The signal was multiplied by the fitted gains: T is free of the unknown flux scale.
         summary = write_transfer(output, found, self.power, 1.0, only_measured=True)
@@ -360,8 +360,6 @@ class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the expected T in bins of k and of length and delay."""
-        import numpy as np
-
         result = read_result(self.calibration)
         found = self.expect(result, 0, self.power.taper)
         if found is None:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
+from calstudy.power.binned import cylindrical_average, modes_in_bins, noise_error, spherical_average, with_errors
+from calstudy.power.tables import save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
 from calstudy.products.files import DATA, read_json, read_visibilities, spectrum_file, write_json
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
@@ -21,9 +27,6 @@ from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Inputs, Task, called
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
     from pyuvdata import UVData
 
     from calstudy.calibrate.records import CalibrationResult
@@ -88,11 +91,6 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectra as HDF5 and CSV, and the level of the noise to noise.json."""
-        import numpy as np
-
-        from calstudy.power.binned import cylindrical_average
-        from calstudy.power.tables import save_spectrum, write_csv
-
         delays = {name: read_delay_spectra(folder) for name, folder in self.delays.items()}
         levels = {
             what: {source: _levels(delays, what, source, self.power.wedge_buffer) for source in SOURCES}
@@ -131,10 +129,6 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
 
     def _spherical(self, spectra: DelaySpectra, noise: DelaySpectra, level: np.ndarray) -> dict[str, SphericalSpectrum]:
         """Return the spherical spectra by their modes, with errors by the noise of each baseline."""
-        from dataclasses import replace
-
-        from calstudy.power.binned import modes_in_bins, spherical_average
-        from calstudy.power.errors import noise_error, with_errors
         from calstudy.realdata.noise import noise_of_units
 
         of_units, found = noise_of_units(spectra, noise, level), {}
@@ -147,8 +141,6 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
 
 def _levels(delays: Mapping[str, DelaySpectra], what: str, source: str, buffer: float) -> np.ndarray | None:
     """Return P_N of each baseline, or None if it is not known from this source."""
-    import numpy as np
-
     from calstudy.realdata.noise import noise_of_baselines
 
     name = f"noise of {what} from {source}"
@@ -160,8 +152,6 @@ def _levels(delays: Mapping[str, DelaySpectra], what: str, source: str, buffer: 
 
 def _summary(difference: np.ndarray | None, autos: np.ndarray | None) -> dict[str, Any]:
     """Return the mean P_N over baselines from each source, and the ratio of the two."""
-    import numpy as np
-
     found: dict[str, Any] = {}
     for name, levels in (("difference", difference), ("autos", autos)):
         found[name] = None if levels is None else float(np.nanmean(levels))

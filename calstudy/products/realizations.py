@@ -13,6 +13,8 @@ from calstudy.base.resources import Cost
 from calstudy.base.table import Table, number
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.experiment.realizations import described, expand_realizations, members
+from calstudy.power.binned import make_bin_edges, noise_level, spherical_average, with_errors
+from calstudy.power.cosmology import input_power
 from calstudy.power.realizations import (
     QUANTITIES,
     TRANSFER_QUANTITIES,
@@ -27,7 +29,9 @@ from calstudy.power.realizations import (
     mean_over_bins,
     pool_region,
 )
+from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum
+from calstudy.power.transfer import TransferFunction
 from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import REALIZATIONS, TRANSFER, read_json, spectrum_file, write_json
@@ -167,10 +171,6 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectra, and the input power at the same k."""
-        from calstudy.power.binned import make_bin_edges, spherical_average
-        from calstudy.power.cosmology import input_power
-        from calstudy.power.errors import noise_level, with_errors
-
         power = self.power
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}
         sigma_noise = 0.0 if self.noise is None else noise_level(spectra.read_delay_spectra(self.noise))
@@ -196,9 +196,6 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
 
 def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequence[Sample]:
     """Read the samples of the first `count` realizations in one of `REGIONS` from the products of `inputs`."""
-    from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.power.transfer import TransferFunction
-
     samples = []
     for place in range(count):
         folder = folders[f"spectra:{place}"]

@@ -1,4 +1,4 @@
-"""Run times of the solvers: measured for each array, their table, and their scaling."""
+"""Run times of the solvers: measured for each array, their table, their scaling, and what statements read of them."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from calstudy.instrument.layouts import antenna_count
 from calstudy.instrument.settings import Channels, Layout
 from calstudy.products.files import read_json, write_json
 from calstudy.run.task import Input, Inputs, Task
+from calstudy.verdicts.criterion import Finding
+from calstudy.verdicts.statement import Unevaluated
 
 CASE, LOSSES, DESCENT, RUNTIME = "case.json", "losses.npz", "descent.json", "runtime.json"
 # The paper's padded step, per byte of its basis.
@@ -279,3 +281,58 @@ def fit_power_law(size: np.ndarray, value: np.ndarray) -> PowerLaw:
         raise ValueError(f"a power law needs positive values at three sizes or more, got {len(value)} at {len(size)}")
     (exponent, logarithm), covariance = np.polyfit(np.log(size), np.log(value), 1, cov=True)
     return PowerLaw(float(np.exp(logarithm)), float(exponent), float(covariance[0, 0] ** 0.5))
+
+
+RUN_TIME = "run_time"
+"""Role of a run-time study."""
+
+
+@dataclass(frozen=True)
+class RunTimeTable:
+    """One run-time study: the name of the run with the machine, and its table.
+
+    The table has ``cases``, one per array and device, and ``descent``.
+    """
+
+    name: str
+    table: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, name: str, path: Path) -> RunTimeTable:
+        """Read the table of a run."""
+        table = read_json(path)
+        return cls(f"{name} on {machine_in_words(table['machine'])}", table)
+
+    def cases(self, panel: str, device: str = "cpu") -> list[Mapping[str, Any]]:
+        """Return the arrays of one panel, the smallest first; raises Unevaluated if that device was not timed."""
+        found = [case for case in self.table["cases"] if (case["panel"], case["device"]) == (panel, device)]
+        if not found:
+            raise Unevaluated(f"needs run times on a {device}; run it with --scale {device} where there is one")
+        return sorted(found, key=lambda case: case["size"])
+
+    def medians(self, panel: str, kind: str, device: str = "cpu") -> np.ndarray:
+        """Return the median seconds of a kind of step or solve for each array, (Nsizes,).
+
+        The panel is "rows" or "line", the device "cpu" or "gpu".
+        """
+        return np.array([case["seconds"][kind]["median"] for case in self.cases(panel, device)])
+
+    def column(self, panel: str, name: str, device: str = "cpu") -> np.ndarray:
+        """Return a property of each array, (Nsizes,), such as "size"; panel and device as for `medians`."""
+        return np.array([case[name] for case in self.cases(panel, device)], float)
+
+    def scaling(self, panel: str, kind: str, against: str = "size", device: str = "cpu") -> PowerLaw:
+        """Fit the medians as a power of a property of the arrays; panel, kind and device as for `medians`."""
+        return fit_power_law(self.column(panel, against, device), self.medians(panel, kind, device))
+
+    def steps_to(self, excess: str) -> Finding:
+        """Return the steps of the paper's solver to within a fraction of the minimum, or its steps as a lower bound."""
+        descent = self.table["descent"]
+        steps = descent["steps_to"][excess]
+        return Finding(descent["max_steps"], 0.0, "at least") if steps is None else Finding(steps, 0.0)
+
+
+def machine_in_words(machine: Mapping[str, Any]) -> str:
+    """Return processor, cores and memory of a machine, and its GPU if it was timed."""
+    words = f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB"
+    return f"{words}, {machine['gpu']}" if machine.get("gpu") else words

@@ -5,10 +5,21 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
+from calstudy.calibrate.agreement import aligned_gains, gain_errors
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.power.binned import make_bin_edges
+from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score
+from calstudy.power.score import score as measure
+from calstudy.power.spectra import of_common_units
+from calstudy.power.tables import save_spectrum
 from calstudy.products import calibration, corruption, expected_loss, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
@@ -19,7 +30,6 @@ from calstudy.products.files import (
     SCORE_BINS,
     SKY_MODEL_ERROR,
     SOLUTION,
-    json_number,
     read_in_parts,
     read_json,
     write_json,
@@ -29,11 +39,6 @@ from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-
-    from calstudy.power.score import CalibratedSpectra, Score
     from calstudy.power.settings import PowerSettings
 
 MEASURED = 2
@@ -97,12 +102,6 @@ class MeasureScore(Task, stage="score", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scores, and all numbers to score.json."""
-        from calstudy.power.binned import make_bin_edges
-        from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra
-        from calstudy.power.score import score as measure
-        from calstudy.power.spectra import of_common_units
-        from calstudy.power.tables import save_spectrum
-
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SPECTRA}
         measured = CalibratedSpectra(**of_common_units(delays))
         known = read_json(self.scale / signal_loss.SCALE)["flux_scale"]
@@ -124,8 +123,6 @@ class MeasureScore(Task, stage="score", version=4):
 
     def _linear_transfer(self, measured: CalibratedSpectra) -> np.ndarray | None:
         """Return T of the linear response in bands, or None if it is not known or of other baselines."""
-        import numpy as np
-
         if self.linear_response is None or np.any(measured.signal.n_pairs != 1):
             return None
         bands = read_json(self.linear_response / expected_loss.RESPONSE)["bands"]
@@ -139,9 +136,6 @@ class MeasureScore(Task, stage="score", version=4):
 
     def _gain_errors(self) -> dict[str, float | None]:
         """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
-        import numpy as np
-
-        from calstudy.calibrate.agreement import aligned_gains, gain_errors
         from calstudy.products.selection import read_gains, true_of
 
         fitted = read_gains(self.calibration[PARITIES[0]])
@@ -161,9 +155,6 @@ class MeasureScore(Task, stage="score", version=4):
         The variance of the noise is half the mean square of the difference of the two. Apart from the power of the EoR,
         chi^2 is 1 for the true gains and foregrounds.
         """
-        import numpy as np
-
-        from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
         from calstudy.products.selection import read_gains
 
         fitted = read_gains(self.calibration[PARITIES[0]])

@@ -6,11 +6,17 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from calstudy.base.files import json_number
 from calstudy.base.resources import Cost
 from calstudy.base.table import Table
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
+from calstudy.power.binned import make_bin_edges
+from calstudy.power.delay import make_taper
 from calstudy.power.spectra import SphericalSpectrum, of_common_units
 from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_transfer_csv
 from calstudy.power.transfer import (
@@ -31,7 +37,6 @@ from calstudy.products.files import (
     AVERAGE,
     TRANSFER,
     TRANSFER_BANDS,
-    json_number,
     read_json,
     read_visibilities,
     spectrum_file,
@@ -42,11 +47,9 @@ from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
-from calstudy.verdicts.measured import marked, why_not_measured
+from calstudy.verdicts.standing import marked, why_not_measured
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from calstudy.power.settings import PowerSettings
 
 REGIONS = {"outside-wedge": False, "inside-wedge": True}
@@ -181,11 +184,9 @@ def write_transfer(
     """Write T per k outside and inside the wedge, in fine bins and in bands, and per (|b|, tau).
 
     The flux scale of the calibration is NaN if it is not known. With `only_measured`, T per k is NaN where it is not
-    measured (`calstudy.verdicts.measured`). Return T in bands, as plain JSON types, by part of Fourier space, with why
+    measured (`calstudy.verdicts.standing`). Return T in bands, as plain JSON types, by part of Fourier space, with why
     it is not measured.
     """
-    from calstudy.power.binned import make_bin_edges
-
     fine, buffer = make_bin_edges(settings.bins), settings.wedge_buffer
     summary: dict[str, Any] = {}
     for region, inside in REGIONS.items():
@@ -251,9 +252,6 @@ class FluxScale(Task, stage="flux-scale", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the flux scale of the first polarization, null if it is not known, to scale.json."""
-        import numpy as np
-
-        from calstudy.power.delay import make_taper
         from calstudy.products.selection import read_gains, true_of
 
         ratios = []

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.constants import SECONDS_PER_DAY, SPEED_OF_LIGHT
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.base.visibilities import from_cube, subset_template, to_cube
 from calstudy.instrument.layouts import layout_of, size_of_instrument
-from calstudy.instrument.settings import beam_count
+from calstudy.instrument.settings import InstrumentSettings, beam_count
 from calstudy.products.files import VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, memoize
 from calstudy.run.task import Piece, Task
 from calstudy.simulate.interface import SimulationSize
 from calstudy.simulate.nodes import (
     EARTH_ROTATION_RATE,
-    SECONDS_PER_DAY,
     Accuracy,
     chebyshev_count,
     frequency_bandwidth,
@@ -29,18 +29,14 @@ from calstudy.simulate.nodes import (
     time_bandwidth,
 )
 from calstudy.sky.counts import FAINTEST, expected_sources
-from calstudy.sky.settings import Eor, Foregrounds, NoSources, PointSources, SyntheticSources
+from calstudy.sky.settings import Eor, Foregrounds, NoSources, PointSources, SkySettings, SyntheticSources
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVData
 
-    from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.chunks import Component
     from calstudy.simulate.floor import DelayFloor
     from calstudy.simulate.settings import SimulationSettings
-    from calstudy.sky.settings import SkySettings
 
 CHUNK = "chunk.uvh5"
 QUALITY = "quality.json"
@@ -128,7 +124,6 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the visibilities to chunk.uvh5; a chunk beyond the last node stays empty."""
-        from calstudy.base.visibilities import subset_template
         from calstudy.simulate.chunks import simulate_chunk as simulate
 
         component = self.component

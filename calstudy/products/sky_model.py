@@ -9,6 +9,9 @@ from typing import Any
 
 from calstudy.base import paths
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
+from calstudy.base.visibilities import to_cube
+from calstudy.calibrate.sky_model import read_sky_model
+from calstudy.corrupt.levels import rms
 from calstudy.experiment.assumed import SKY_MODEL, AssumedWorld, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.settings import InstrumentSettings
@@ -112,7 +115,6 @@ class ReadSkyModel(Task, stage="sky-model", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the visibilities to visibilities.uvh5."""
-        from calstudy.calibrate.sky_model import read_sky_model
         from calstudy.instrument.telescope import make_template
 
         write_visibilities(read_sky_model(self.path, make_template(self.instrument)), output / VISIBILITIES)
@@ -131,9 +133,6 @@ class SkyModelError(Task, stage="sky-model-error", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the rms of the true foregrounds, of the sky model, and of their difference to sky-model.json, Jy."""
-        from calstudy.base.visibilities import to_cube
-        from calstudy.corrupt.levels import rms
-
         folders = (self.foregrounds, self.sky_model)
         true, model = (to_cube(read_visibilities(folder / VISIBILITIES)) for folder in folders)
         true_rms, difference = rms(true), rms(model - true)

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
+from calstudy.power.binned import cylindrical_average, noise_level, spherical_average, with_errors
+from calstudy.power.interface import estimate_spectra
+from calstudy.power.spectra import DelaySpectra
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
@@ -18,14 +24,11 @@ from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVData
 
     from calstudy.instrument.settings import Beam, Channels
     from calstudy.power.average import Block
     from calstudy.power.settings import PowerSettings
-    from calstudy.power.spectra import DelaySpectra
 
 EXCISION = {"all-modes": False, "outside-wedge": True}
 """Spherical averages; true for the one without the wedge."""
@@ -105,8 +108,6 @@ class InBlocks(Task):
 
     def blocks_of(self, data: UVData) -> list[Block]:
         """Return the blocks of a data set."""
-        import numpy as np
-
         from calstudy.power.average import Block, divide
 
         times = np.unique(data.time_array)
@@ -151,10 +152,7 @@ class Power(Task, stage="power", version=4):
 
         Spectra are NaN if all data are flagged because no solve gave gains.
         """
-        import numpy as np
-
         from calstudy.instrument.beams import make_beam
-        from calstudy.power.interface import estimate_spectra
 
         even, odd = averages = [read_visibilities(folder / AVERAGE) for folder in (self.even, self.odd)]
         empty = any(uvd.flag_array.all() for uvd in averages)
@@ -179,8 +177,6 @@ class Power(Task, stage="power", version=4):
 
 def read_delay_spectra(folder: Path) -> DelaySpectra:
     """Read a product of the stage `power`."""
-    from calstudy.power.spectra import DelaySpectra
-
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
 
@@ -198,11 +194,6 @@ class Spectra(Task, stage="spectra", version=3, cost=Cost(2, disk=5e6)):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write, for every variant, wedge.h5 and the two spherical spectra, as HDF5 and CSV."""
-        import numpy as np
-
-        from calstudy.power.binned import cylindrical_average, spherical_average
-        from calstudy.power.errors import noise_level, with_errors
-
         reference = {name: read_delay_spectra(folder) for name, folder in self.reference.items()}
         sigma_noise = noise_level(reference["noise"]) if "noise" in reference else 0.0
         signals = {name: spherical_average(reference["eor"], self.power, excise) for name, excise in EXCISION.items()}

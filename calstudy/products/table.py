@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from pathlib import Path
+from typing import Any, ClassVar, cast
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.table import Table, number
 from calstudy.experiment.model import TABLES
 from calstudy.run.task import Inputs, Job, Task
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class StudyTable(Plugin):

@@ -16,15 +16,12 @@ import numpy as np
 from astropy import units
 
 from calstudy.base.errors import InputError
+from calstudy.verdicts.standing import LIMIT, SIGMAS
 
-LIMIT = 0.1
-"""Largest tolerated bias, over the EoR."""
 BAND = (0.2, 0.5)
 """Band of k, h/Mpc, in which the bias is measured."""
 COUNTS = 1.0
 """A band of k counts if the upper limit of the bias is below this part of the EoR."""
-SIGMAS = 2.0
-"""Number of standard deviations below which a bias is not significant."""
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 

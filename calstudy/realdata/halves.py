@@ -5,20 +5,21 @@ The halves, even and odd, see the same sky with independent noise.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
+from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.settings import Channels, Size
 from calstudy.realdata.selection import Selection, parse_values, select
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from pyuvdata import UVData
 
     from calstudy.power.settings import PowerSettings
@@ -28,7 +29,6 @@ WHOLE = "whole"
 """The part that is all of the data."""
 FEED_TOLERANCE = np.radians(1)
 LEAST_CHANNELS = 8
-SECONDS_PER_DAY = 86400.0
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,6 @@ def read_facts(
     baselines, or `even` is not satisfied.
     """
     # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
-    from calstudy.calibrate.records import PARALLEL_HANDS
     from calstudy.realdata.reading import place_antennas, read_metadata
 
     data = read_metadata(paths)

@@ -22,12 +22,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
-from calstudy.power.spectra import outside_wedge
+from calstudy.power.spectra import DelaySpectra, outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
-
-    from calstudy.power.spectra import DelaySpectra
 
 
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:

@@ -10,6 +10,7 @@ import numpy as np
 from astropy.time import Time
 from pyuvdata import UVCal, UVData
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.gains import gain_products
 from calstudy.base.visibilities import (
     antenna_pairs,
@@ -243,7 +244,7 @@ def held_out(data: UVData, prediction: UVData) -> tuple[float, int]:
     use_bundled_earth_orientation()
     total, count = 0.0, 0
     times, known = (np.unique(uvd.time_array) for uvd in (data, prediction))
-    longest = NEIGHBOURS * float(np.max(data.integration_time)) / 86400
+    longest = NEIGHBOURS * float(np.max(data.integration_time)) / SECONDS_PER_DAY
     for time in times:
         before, after = known[known < time], known[known > time]
         if not before.size or not after.size or max(time - before[-1], after[0] - time) > longest:

@@ -17,6 +17,7 @@ import numpy as np
 from astropy import units
 from pyuvdata import UVData, utils
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gain_files import CASACORE
@@ -190,7 +191,7 @@ def _share_times(data: UVData, notes: list[str]) -> None:
         f"Baselines were averaged over {shortest:.3g} to {integration.max():.3g} s; all are copied to the shortest."
     )
     middle = np.asarray(data.time_array)
-    tolerance = 0.4 * shortest / 86400
+    tolerance = 0.4 * shortest / SECONDS_PER_DAY
     times = np.unique(middle)
     starts = np.concatenate([[True], np.diff(times) > tolerance])
     data.time_array = times[starts][np.cumsum(starts)[np.searchsorted(times, middle)] - 1]

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.table import two_digits
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.measured import marked, why_not_measured
+from calstudy.verdicts.standing import marked, why_not_measured
 from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
 BAND = (0.2, 0.5)
@@ -72,7 +73,7 @@ class Signal:
         if abs(self.bias) < 1 or abs(self.bias) < SIGNIFICANT * self.bias_error:
             return None
         return (
-            f"{PLACE}, the residual without EoR has {_rounded(abs(self.bias))} times the power of the EoR: "
+            f"{PLACE}, the residual without EoR has {two_digits(abs(self.bias))} times the power of the EoR: "
             "its power spectrum says nothing of the EoR there"
         )
 
@@ -133,8 +134,3 @@ def _verdicts(claims: Sequence[Verdict]) -> Number | None:
 def _with_error(value: float, error: float) -> str:
     digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < 10 else 0
     return f"{value:.{digits}f} ± {error:.{digits}f}"
-
-
-def _rounded(value: float) -> str:
-    """Write a ratio with two digits, without an exponent."""
-    return f"{float(f'{value:.2g}'):,.10g}"

@@ -46,7 +46,7 @@ class Chart:
 
 
 def read_charts(path: Path) -> list[Chart]:
-    """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.save`); none for other arrays.
+    """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.style`); none for other arrays.
 
     An entry ``GROUP.FIELD`` is a field of a spectrum: `power` over `k`, a transfer function over `k`, or either over
     `k_perp` and `k_parallel`.

@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.gains import read_gain_errors
 from calstudy.base.table import Table, from_json
 from calstudy.calibrate.agreement import Statistic
 from calstudy.calibrate.agreement import from_json as statistics_from_json
 from calstudy.experiment.assumed import assumed_changes
-from calstudy.experiment.files import validate
+from calstudy.experiment.files import read_mapping, validate
 from calstudy.experiment.model import Experiment
-from calstudy.experiment.yaml_files import read_mapping
 from calstudy.power.expected import ExpectedBins
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
@@ -233,8 +233,6 @@ def gain_errors(path: Path) -> xarray.Dataset:
     """
     import xarray
     from pyuvdata import UVCal
-
-    from calstudy.base.gains import read_gain_errors
 
     amplitude, phase = read_gain_errors(path)
     gains = UVCal.from_file(path)

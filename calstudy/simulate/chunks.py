@@ -18,7 +18,7 @@ import numpy as np
 
 from calstudy.base.visibilities import subset_template
 from calstudy.instrument.antenna_beams import make_beams
-from calstudy.instrument.interface import model_of
+from calstudy.instrument.interface import AntennaBeams, model_of
 from calstudy.instrument.telescope import make_template
 from calstudy.power.cosmology import make_cosmology
 from calstudy.simulate.interface import BeamSource, Engine, simulate_with
@@ -26,16 +26,14 @@ from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, frequency_bl
 from calstudy.simulate.sources import sky_cells
 from calstudy.sky.eor import EorField
 from calstudy.sky.foregrounds import make_foregrounds
-from calstudy.sky.settings import Eor
+from calstudy.sky.settings import Diffuse, Eor, Foregrounds
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
-    from calstudy.instrument.interface import AntennaBeams
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.settings import SimulationSettings
-    from calstudy.sky.settings import Diffuse, Foregrounds
 
 logger = logging.getLogger(__name__)
 

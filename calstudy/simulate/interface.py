@@ -12,7 +12,7 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.resources import Cost
-from calstudy.base.visibilities import require_rectangular
+from calstudy.base.visibilities import require_rectangular, subset_template
 from calstudy.simulate.nodes import EXACT, Accuracy, integration_times, time_axis
 
 if TYPE_CHECKING:
@@ -108,7 +108,6 @@ class Engine(Plugin, ABC):
         By default sources that stay above the horizon are simulated at time nodes and interpolated. Sources that rise
         or set are discontinuous in time, and are simulated at every integration.
         """
-        from calstudy.base.visibilities import subset_template
         from calstudy.simulate.sources import SourceTracks, split_by_horizon
 
         axis, integrations = time_axis(template, accuracy), integration_times(template)

@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import jv
 
-from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.constants import SECONDS_PER_DAY, SPEED_OF_LIGHT
 from calstudy.base.visibilities import baseline_vectors
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
 EARTH_ROTATION_RATE = 7.2921158553e-5  # rad / s, sidereal
-SECONDS_PER_DAY = 86400.0
 SINGLE_PRECISION = 1e-5
 """Smallest tolerance for which products in single precision are accurate enough."""
 CHUNK_BYTES = 4e8

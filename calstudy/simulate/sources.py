@@ -14,11 +14,11 @@ from astropy_healpix import nside_to_pixel_area
 from pyradiosky import SkyModel
 from pyradiosky.utils import jy_to_ksr
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import use_bundled_earth_orientation
 from calstudy.simulate.nodes import (
     EARTH_ROTATION_RATE,
-    SECONDS_PER_DAY,
     chebyshev_count,
     chebyshev_nodes,
     interpolation_matrix,

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
+from calstudy.base.gain_files import read_gains, write_gains
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
@@ -212,7 +213,6 @@ class DataCalibration(DataStudy):
 
         Raises InputError if a file cannot be used.
         """
-        from calstudy.base.gain_files import read_gains
         from calstudy.calibrate.weights import conspicuous
 
         data, _, notes = observed(self.graph, WHOLE).read()
@@ -261,8 +261,6 @@ class DataCalibration(DataStudy):
     def _write_gains_also(self, work: Path) -> None:
         """Write the gains of a folder in other formats."""
         from pyuvdata import UVCal
-
-        from calstudy.base.gain_files import write_gains
 
         if self.file.also:
             gains = UVCal.from_file(work / GAINS)

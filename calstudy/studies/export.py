@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from string import Template
 from typing import TYPE_CHECKING, Any
 
 import yaml
@@ -17,6 +18,7 @@ from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.base.gain_files import CASACORE
+from calstudy.base.visibilities import flag_cube, from_cube, to_cube
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
@@ -39,46 +41,8 @@ README, LOG = "README.md", "export.log"
 SKY_MODEL = "sky-model"
 CARRIER = {"none": "none"}
 """Calibrator of exported worlds, on which data and assumptions do not depend."""
-TEXT = """\
-# Data to be calibrated
-
-Written by calstudy {version}. The data are simulated: {antennas} antennas, {channels} channels from {first:.3f} to
-{last:.3f} MHz, {times} integrations of {integration:g} s, polarization{plural} {polarizations}.
-
-| file | content |
-|---|---|
-{rows}
-| `{manifest}` | what ties this folder to its experiment; return it with the gains |
-
-## What to return
-
-For every data file a file of gains, in this folder or in a new one with a copy of `{manifest}`:
-{returned}. Allowed are CalH5 (`.calh5`), calfits (`.calfits`),
-CASA tables (`.cal`, a folder), and what DP3 (H5Parm, `.h5`), hyperdrive (`.fits`) and calibrate of mwa-reduce (`.bin`)
-write when they calibrate UVFITS files or measurement sets.
-
-Besides, if you fitted one, a model of the foregrounds for every data file: {models}
-and so on (or `.model.uvfits`, `.model.ms`), visibilities in Jy before any gains, with the samples of the data, none of
-them flagged. Without it, {default}.
-
-Calibrate every data file by itself. The files differ in their noise and in what they contain; to compare them with each
-other is not calibration.
-
-## Conventions
-
-- V_measured = g_a conj(g_b) V_true for the baselines (a, b) of the files; noise is part of V_true. Gains are of the
-  convention "divide" of pyuvdata: data are calibrated by dividing by g_a conj(g_b). Files that say "multiply" are
-  inverted. Files of DP3, hyperdrive and calibrate are taken in the conventions of these programs.
-- Gains are complex numbers for every antenna, channel and feed; antennas are told by their numbers. They are for one
-  time, which holds for all, or for every integration (times agree within half an integration).
-- Gains that are not known are flagged; samples with a flagged gain, and data that are flagged, have no part in the
-  result.
-- Feed x is east-west, feed y north-south; V_xx = I / 2 for unpolarized emission of Stokes I.
-- Fluxes are in Jy. {phase}
-- Samples that are not flagged have the same weight; nsamples is one everywhere.
-- {noise}
-- Antenna positions, and the sky model, are what is assumed, and need not be true.
-"""
+TEXT = Path(__file__).with_suffix(".md")
+"""Template of the README of exported data."""
 
 
 def export(
@@ -154,8 +118,6 @@ def _write_world(content: WorldData, products: Mapping[str, Product], folder: Pa
 
 def _at(template: UVData, uvd: UVData) -> UVData:
     """Return visibilities and flags with the metadata of the template only."""
-    from calstudy.base.visibilities import flag_cube, from_cube, to_cube
-
     found = from_cube(template, to_cube(uvd))
     flag_cube(found)[:] = flag_cube(uvd)
     return found
@@ -182,14 +144,14 @@ def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
     phased = f"Data are phased to the zenith of the first integration, as {file_format} wants them."
     if manifest.sky_model is not None:
         rows.append(f"| `{manifest.sky_model}` | visibilities of the foregrounds as far as they are known |")
-    return TEXT.format(
+    return Template(TEXT.read_text(encoding="utf-8")).substitute(
         version=manifest.calstudy,
         antennas=template.Nants_data,
         channels=template.Nfreqs,
-        first=template.freq_array.min() / 1e6,
-        last=template.freq_array.max() / 1e6,
+        first=f"{template.freq_array.min() / 1e6:.3f}",
+        last=f"{template.freq_array.max() / 1e6:.3f}",
         times=template.Ntimes,
-        integration=template.integration_time[0],
+        integration=f"{template.integration_time[0]:g}",
         plural="s" if template.Npols > 1 else "",
         polarizations=", ".join(PARALLEL_HANDS[int(number)] for number in template.polarization_array),
         rows="\n".join(rows),

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import types
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import wrap
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -17,22 +16,14 @@ from pydantic_core import PydanticUndefined
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.base.plugins import Plugin, Registry
-from calstudy.base.schema import KindField, Kinds
+from calstudy.base.schema import KindField, Kinds, alternatives
 from calstudy.base.user_code import load_file
 from calstudy.experiment.model import Experiment
 from calstudy.studies.study import KINDS, Study, built_in_kinds
 
 
-def _alternatives(annotation: Any) -> list[Any]:
-    if get_origin(annotation) is Annotated:
-        return _alternatives(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, types.UnionType):
-        return [found for member in get_args(annotation) for found in _alternatives(member)]
-    return [annotation]
-
-
 def _blocks(annotation: Any) -> list[type[BaseModel]]:
-    return [item for item in _alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
+    return [item for item in alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
 
 
 def _kinds(info: FieldInfo) -> Kinds[Any] | None:
@@ -53,7 +44,7 @@ def _kind(info: FieldInfo) -> str:
     if (unit := _unit(info)) is not None:
         return f"quantity in {unit}"
     words = []
-    for item in _alternatives(info.annotation):
+    for item in alternatives(info.annotation):
         if get_origin(item) is Literal:
             words.append(" \\| ".join(f"`{value}`" for value in get_args(item)))
         elif get_origin(item) is tuple:
@@ -85,7 +76,7 @@ def _default(info: FieldInfo) -> str:
 def _rows(model: type[BaseModel]) -> Iterator[str]:
     tag = model.registry.tag if issubclass(model, Plugin) else None
     for name, info in model.model_fields.items():
-        words = any(get_origin(item) is Literal for item in _alternatives(info.annotation))
+        words = any(get_origin(item) is Literal for item in alternatives(info.annotation))
         if name != tag and (words or not _blocks(info.annotation)):
             yield f"| `{name}` | {_kind(info)} | {_default(info)} | {info.description or ''} |"
 
@@ -122,7 +113,7 @@ def _blocks_of(info: FieldInfo, path: str, listed: dict[str, str]) -> Iterator[s
 
 def _items(annotation: Any) -> list[type[BaseModel]]:
     """Return the blocks, but for plug-ins, that a field accepts as items of a list, or as values of a mapping."""
-    lists = [item for item in _alternatives(annotation) if get_origin(item) in (tuple, dict)]
+    lists = [item for item in alternatives(annotation) if get_origin(item) in (tuple, dict)]
     return [
         block for item in lists for value in get_args(item) for block in _blocks(value) if not issubclass(block, Plugin)
     ]

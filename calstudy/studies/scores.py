@@ -32,8 +32,7 @@ from calstudy.run.store import Store
 from calstudy.studies.folder import log_to
 from calstudy.studies.kinds.comparison import Comparison, WorldData
 from calstudy.studies.study import make
-from calstudy.verdicts.measured import LARGEST_ERROR, is_measured
-from calstudy.verdicts.standing import standing_table, standings
+from calstudy.verdicts.standing import LARGEST_ERROR, is_measured, standing_table, standings
 
 LOG = "score.log"
 VERIFIED = "verified.txt"

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from calstudy.base.resources import LIBRARIES_MEMORY, free_memory, parse_memory, total_memory
 from calstudy.base.table import Table
+from calstudy.instrument.layouts import describe
 from calstudy.products.files import REALIZATIONS
 from calstudy.report.headline import PLACE, measured_numbers, read_signal
 from calstudy.report.page import REPORT
@@ -115,8 +116,6 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
 
 def sites(tasks: Sequence[Task]) -> list[str]:
     """Name the sites of the arrays of simulations, once each."""
-    from calstudy.instrument.layouts import describe
-
     instruments = [task.settings["instrument"] for task in tasks if "instrument" in task.settings]
     return list(dict.fromkeys(describe(found.site) for found in instruments))
 

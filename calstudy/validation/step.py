@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import json_number
 from calstudy.base.plugins import Registry, guarded
 from calstudy.base.resources import Cost
 from calstudy.base.schema import UNKEYED
@@ -27,7 +28,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.power.cosmology import input_power
 from calstudy.power.spectra import DelaySpectra
 from calstudy.products.corruption import LEVELS
-from calstudy.products.files import json_number, read_json, write_json
+from calstudy.products.files import read_json, write_json
 from calstudy.products.graph import Graph
 from calstudy.products.spectra import read_delay_spectra
 from calstudy.results.reader import Tables
@@ -35,7 +36,7 @@ from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
 from calstudy.verdicts.statement import Statement, Unevaluated
 
-STEPS: Registry[Step] = Registry("step", "calstudy.validation.steps", "calstudy.validation.step:Step")
+STEPS: Registry[Step] = Registry("step", "calstudy.validation.steps", "calstudy.validation.step:Step", families=True)
 FINDINGS = "measurement.json"
 CHAIN = "validation/small/chain.yaml"
 """The experiment of all steps at small scale."""

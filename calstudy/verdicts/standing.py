@@ -3,7 +3,7 @@
 In a band of k, a calibrator
 
 - *passes* in a world if its bias is below the limit by two standard deviations, |bias| + 2 sigma < limit, and T is
-  measured (`calstudy.verdicts.measured`),
+  measured (`calstudy.verdicts.standing`),
 - *fails* if it is above by two standard deviations, if T is not that of a solution (below -0.1 or above 1.2 by more
   than two standard deviations), or if the calibrator cannot work there,
 - is *open* otherwise: the errors of this run are too large to tell. Without a bias, the measured one is about sigma,
@@ -20,8 +20,31 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from calstudy.base.table import Table
-from calstudy.verdicts.measured import HIGHEST, LOWEST, is_measured
+from calstudy.base.table import Table, two_digits
+
+LOWEST, HIGHEST = -0.1, 1.2
+LARGEST_ERROR = 0.3
+"""Standard deviation above which T is not measured."""
+
+
+def is_measured(transfer: float | None, error: float | None) -> bool:
+    """Return whether T is measured; a T or an error that is None is not known."""
+    return why_not_measured(transfer, error) == ""
+
+
+def why_not_measured(transfer: float | None, error: float | None) -> str:
+    """Explain in a few words why T is not measured; return an empty text where it is."""
+    if error is not None and error > LARGEST_ERROR:
+        return f"error {error:.2g}"
+    if transfer is None or math.isnan(transfer):
+        return "no modes"
+    return "" if LOWEST <= transfer <= HIGHEST else f"T {transfer:.2g}"
+
+
+def marked(text: str, transfer: float | None, error: float | None) -> str:
+    """Return T as it is written, in brackets after "not measured" where it is not."""
+    return f"not measured ({text})" if why_not_measured(transfer, error) else text
+
 
 Standing = Literal["passes", "open", "fails"]
 WORST = ("fails", "open", "passes")
@@ -68,7 +91,7 @@ class InWorld:
         if self.refused:
             return f"{self.world} (cannot work)"
         is_solution = LOWEST <= self.transfer <= HIGHEST
-        return f"{self.world} ({f'bias {_short(self.bias)}' if is_solution else f'T {_short(self.transfer)}'})"
+        return f"{self.world} ({f'bias {two_digits(self.bias)}' if is_solution else f'T {two_digits(self.transfer)}'})"
 
 
 @dataclass(frozen=True)
@@ -120,7 +143,7 @@ class InBand:
     @property
     def numbers(self) -> str:
         """The upper limit of the bias in all worlds, and the smallest T."""
-        return f"bias < {_short(self.upper_limit)}, {self.kept}"
+        return f"bias < {two_digits(self.upper_limit)}, {self.kept}"
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -196,7 +219,9 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
         parts, least = [f"take {first.calibrator} ({first.numbers})"], first.transfer + MORE
         largest = first.decisive[0]
         seen = abs(largest.bias) > SIGMAS * largest.bias_error
-        parts.append(f"its bias is largest in {largest.world} ({_short(largest.bias)})" if seen else "no bias is seen")
+        parts.append(
+            f"its bias is largest in {largest.world} ({two_digits(largest.bias)})" if seen else "no bias is seen"
+        )
         parts += [f"others that pass: {_listed(others)}"] if others else []
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
@@ -224,7 +249,3 @@ def standing_table(found: Sequence[InBand]) -> Table:
     columns = ("calibrator", *(f"k {low:g} to {high:g} h/Mpc" for low, high in bands))
     rows = [(name, *(cells.get((name, band), "-") for band in bands)) for name in names]
     return Table(columns, rows, "Which calibrator to trust", note)
-
-
-def _short(value: float) -> str:
-    return f"{float(f'{value:.2g}'):,.10g}"

@@ -21,7 +21,7 @@ from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, DpssSmoothing, Solve
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import FlagWeights, GaussNewtonSettings
-from calstudy.corrupt.effects.decoherence import Decoherence
+from calstudy.corrupt.effects.losses import Decoherence
 from calstudy.corrupt.interface import apply_effect, draw_truth
 
 NOISE, CHANNELS = 1e-4, 16

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 
-from calstudy.calibrate.gain_coverage import EXPECTED, GainCoverage, pulls
+from calstudy.calibrate.agreement import EXPECTED, GainCoverage, pulls
 from calstudy.calibrate.gain_errors import gain_errors
 
 TOY = make_toy(scattered(5), noise=0.1)

@@ -8,8 +8,8 @@ from test_claims import ADAMAX, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, v
 
 from calstudy.base.errors import InputError
 from calstudy.claims.evaluation import Claims, evaluate_by_solver, evaluate_folder
-from calstudy.figures.solver_comparison import SolverComparison
-from calstudy.plotting.save import figure_arrays
+from calstudy.figures.members import SolverComparison
+from calstudy.plotting.style import figure_arrays
 from calstudy.run.task import Job
 from calstudy.studies.load import load_study
 from calstudy.verdicts.tables import CLAIMS_FILES

@@ -1,7 +1,5 @@
 """Corruption: levels, noise and gains are what the paper says."""
 
-import re
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,7 +19,6 @@ from calstudy.corrupt.levels import rms, set_levels
 from calstudy.corrupt.noise import thermal_noise
 from calstudy.corrupt.settings import EFFECTS, CorruptionSettings
 from calstudy.experiment.files import validate
-from calstudy.experiment.model import Variant
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
@@ -239,18 +236,3 @@ def test_two_effects_with_one_seed_are_refused():
     settings = CorruptionSettings.model_validate(both)
     assert settings.gains == PerChannelGains()
     assert CorruptionSettings(effects=()).gains is None
-
-
-@pytest.mark.parametrize(
-    ("block", "told"),
-    [
-        ({"kind": "reflection", "delay": "800 ns"}, "effects: [{kind: reflection-gains, delay: 800 ns}]"),
-        ({"sigma": 0.2}, "effects: [{kind: per-channel-gains, sigma: 0.2}]"),
-        ("unity", "effects: []"),
-    ],
-)
-def test_the_former_field_is_answered_with_the_new_one(block, told):
-    with pytest.raises(ValidationError, match=re.escape(f"is now corruption.effects, a list: {told}")):
-        CorruptionSettings.model_validate({"gains": block})
-    with pytest.raises(ValidationError, match="is now 'effects'"):
-        Variant.model_validate({"components": ["eor"], "gains": True})

@@ -8,7 +8,7 @@ from observations import small_instrument
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
-from calstudy.corrupt.effects.decoherence import Decoherence
+from calstudy.corrupt.effects.losses import Decoherence
 from calstudy.corrupt.interface import apply_effect, draw_flags, draw_truth, require_usable
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.instrument.telescope import make_template

@@ -14,7 +14,7 @@ from calstudy.base.identity import identity
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.corrupt.effects.additive import Rfi
-from calstudy.corrupt.effects.flags import ChannelFlags, DeadAntennas
+from calstudy.corrupt.effects.losses import ChannelFlags, DeadAntennas
 from calstudy.corrupt.interface import Effect, apply_effect, draw_flags, draw_truth
 from calstudy.experiment.files import override, validate
 from calstudy.instrument.telescope import make_template

@@ -27,7 +27,7 @@ from calstudy.products.calibration import calibration, with_autocorrelations
 from calstudy.products.files import read_json, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.realdata.noise import radiometer_variance
-from calstudy.validation.steps.noise import noise_power
+from calstudy.validation.steps.estimator import noise_power
 
 
 def radiometer(**settings: object):

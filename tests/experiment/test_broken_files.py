@@ -157,7 +157,6 @@ COMMANDS = [
     (["validate", "--ladder", "nowhere"], "--ladder: not a step of the ladder"),
     (["fields", "nowhere.py"], "nowhere.py"),
     (["data", "fetch", "banana"], "nothing that can be fetched (allowed: gleam, beam, g4jy, haslam)"),
-    (["check", "engine", "file.yaml"], "checks are figures: calstudy run checks"),
     (["calibrate"], "Missing argument"),
     (["calibrate", "nowhere.uvh5"], "'nowhere.uvh5': no such file or folder"),
     (["calibrate", "list.yaml"], "list.yaml: cannot be read as visibilities"),

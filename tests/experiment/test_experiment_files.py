@@ -6,9 +6,17 @@ import pytest
 import yaml
 
 from calstudy.base.errors import InputError
-from calstudy.experiment.files import apply_scale, dump, load, override, parse_override, validate
+from calstudy.experiment.files import (
+    apply_scale,
+    dump,
+    load,
+    override,
+    parse_override,
+    parse_yaml,
+    read_mapping,
+    validate,
+)
 from calstudy.experiment.model import Experiment
-from calstudy.experiment.yaml_files import parse_yaml, read_mapping
 from calstudy.studies.kinds.collection import Collection
 from calstudy.studies.load import load_study
 from calstudy.studies.preflight import require_calibration

@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calstudy.figures.baselines import BaselineSpectra, draw_baselines
 from calstudy.figures.gains import compare_gains, draw_gains, draw_reflections
 from calstudy.figures.layout import LayoutPanel, draw_layouts
+from calstudy.figures.members import draw_solver_comparison
 from calstudy.figures.runtime import draw_runtime, summarize_runtime
-from calstudy.figures.solver_comparison import draw_solver_comparison
 from calstudy.figures.spherical import SphericalColumn, draw_spherical, draw_spherical_comparison
 from calstudy.figures.visibilities import (
+    BaselineSpectra,
     Visibilities,
     VisibilityComparison,
     compare_visibilities,
+    draw_baselines,
     draw_data,
     draw_model,
 )
 from calstudy.figures.wedge import WedgePanels, draw_wedge
 from calstudy.plotting import style
-from calstudy.plotting.domains import in_two_domains
+from calstudy.plotting.axes import in_two_domains
 from calstudy.power.delay import delays
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 

@@ -6,11 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calstudy.calibrate.degeneracy import align
-from calstudy.figures.baselines import draw_baselines
 from calstudy.figures.gains import compare_gains, draw_gains, draw_reflections
 from calstudy.figures.runtime import draw_runtime, summarize_runtime
-from calstudy.figures.visibilities import draw_data, draw_model
-from calstudy.plotting.domains import in_two_domains
+from calstudy.figures.visibilities import draw_baselines, draw_data, draw_model
+from calstudy.plotting.axes import in_two_domains
 from calstudy.power.delay import horizon_delay
 
 C = 299792458.0

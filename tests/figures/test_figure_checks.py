@@ -11,7 +11,7 @@ from pyradiosky import SkyModel
 from calstudy.base.errors import ExperimentError
 from calstudy.experiment.files import validate
 from calstudy.figures.beam_fit import compare_floors, compare_interpolations, draw_delay_floors, draw_interpolations
-from calstudy.figures.source_counts import count_sources, draw_counts
+from calstudy.figures.simulated_sky import count_sources, draw_counts
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.sky.counts import draw_population
 

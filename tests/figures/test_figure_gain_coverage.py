@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from tiny import tiny
 
-from calstudy.calibrate.gain_coverage import EXPECTED, GainCoverage
+from calstudy.calibrate.agreement import EXPECTED, GainCoverage
 from calstudy.experiment.files import override, validate
 from calstudy.figures.gain_coverage import ALLOWED, GainCoverageFigure, draw_gain_coverage, pooled
 from calstudy.studies.kinds.experiment import ExperimentStudy

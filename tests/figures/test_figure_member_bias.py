@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calstudy.base.constants import SIGMAS_95
-from calstudy.figures.member_bias import MemberBias, draw_member_bias
+from calstudy.figures.members import MemberBias, draw_member_bias
 from calstudy.studies.load import load_study
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"

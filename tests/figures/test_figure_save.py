@@ -9,7 +9,7 @@ from matplotlib.image import imread
 
 from calstudy.figures.spherical import draw_spherical
 from calstudy.figures.wedge import draw_wedge
-from calstudy.plotting.save import figure_arrays, save_figure
+from calstudy.plotting.style import figure_arrays, save_figure
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 
 from calstudy.figures.signal_loss import SignalLoss, draw_signal_loss
 from calstudy.figures.sweep import SweepPanel, draw_sweep
-from calstudy.plotting.save import figure_arrays
+from calstudy.plotting.style import figure_arrays
 from calstudy.power.transfer import TransferFunction, TransferMap
 
 

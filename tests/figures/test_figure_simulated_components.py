@@ -10,7 +10,7 @@ from astropy.cosmology import Planck15
 
 from calstudy.base.visibilities import baseline_vectors, from_cube
 from calstudy.experiment.files import validate
-from calstudy.figures.simulated_components import draw_components, measure_components
+from calstudy.figures.simulated_sky import draw_components, measure_components
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.telescope import make_template
 from calstudy.power.cosmology import input_power

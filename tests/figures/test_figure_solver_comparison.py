@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import same_color
 
-from calstudy.figures.solver_comparison import SOLVERS, draw_solver_comparison
+from calstudy.figures.members import SOLVERS, draw_solver_comparison
 from calstudy.plotting import style
 
 

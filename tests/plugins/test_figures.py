@@ -17,7 +17,7 @@ from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.model import FIGURES
-from calstudy.regression.comparison import accept, compare_figures, read_reference, read_run, rules_of
+from calstudy.regression import accept, compare_figures, read_reference, read_run, rules_of
 from calstudy.report.page import read_contents
 from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget

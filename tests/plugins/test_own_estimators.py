@@ -8,8 +8,7 @@ from plugin_files import Plugged, make
 
 from calstudy.base.errors import ExperimentError
 from calstudy.experiment.model import Variant
-from calstudy.power.binned import cylindrical_average
-from calstudy.power.errors import noise_level
+from calstudy.power.binned import cylindrical_average, noise_level
 from calstudy.products import spectra
 from calstudy.products.graph import Graph
 from calstudy.studies.reference import field_reference, plugin_reference

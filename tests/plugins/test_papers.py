@@ -17,7 +17,7 @@ from tiny import tiny
 from calstudy.base.errors import InputError
 from calstudy.claims.evaluation import evaluate_folder
 from calstudy.experiment.files import override, validate
-from calstudy.regression.comparison import accept, read_reference
+from calstudy.regression import accept, read_reference
 from calstudy.report.page import read_contents
 from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
+from calstudy.power import binned, delay
 from calstudy.power import cosmology as c
-from calstudy.power import delay, errors
 from calstudy.power.binned import cylindrical_average, make_bin_edges, modes_in_bins, spherical_average
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
@@ -206,9 +206,9 @@ def test_noise_errors_equal_the_scatter(taper, n):
     n_pairs = np.full(n_units, 1 if n == 1 else n * (n - 1))
     spectra = make_spectra(power[0], vectors, n_pairs, taper)
     trial, values, filled = spherical_averages(power, spectra, SETTINGS, exclude_wedge=True)
-    levels = [errors.noise_level(dataclasses.replace(spectra, power=one)) for one in power]
+    levels = [binned.noise_level(dataclasses.replace(spectra, power=one)) for one in power]
     assert np.sqrt(np.mean(np.square(levels))) == pytest.approx(np.sqrt(0.5), rel=0.01)
-    predicted = errors.with_errors(trial, noise=np.sqrt(0.5)).error[filled]
+    predicted = binned.with_errors(trial, noise=np.sqrt(0.5)).error[filled]
     # 1500 trials give each standard deviation to 2 %.
     np.testing.assert_allclose(values.std(axis=0), predicted, rtol=0.07)
     assert np.mean(values.std(axis=0) / predicted) == pytest.approx(1.0, abs=0.015)
@@ -225,7 +225,7 @@ def test_sample_variance_equals_the_scatter(n):
     settings = PowerSettings(bins=KBins(min="1.5 h/Mpc", max="6.0 h/Mpc", width="0.5 h/Mpc"))
     trial, values, filled = spherical_averages(power, make_spectra(power[0], vectors, n_pairs), settings, False)
     expected = dataclasses.replace(trial, power=np.ones_like(trial.power))
-    predicted = errors.with_errors(expected, signal=expected)
+    predicted = binned.with_errors(expected, signal=expected)
     np.testing.assert_allclose(predicted.noise_error[filled], 0)
     np.testing.assert_allclose(values.mean(axis=0), 1.0, rtol=0.05)
     assert np.mean(values.std(axis=0) / predicted.error[filled]) == pytest.approx(1.0, abs=0.02)
@@ -262,7 +262,7 @@ def test_signal_of_neighbouring_baselines_is_not_counted_twice():
     spectra = make_spectra(power[0], vectors, taper="none")
     trial, values, _ = spherical_averages(power, spectra, settings, False)
     expected = dataclasses.replace(trial, power=np.ones(1, dtype=complex))
-    assert values.std() / errors.with_errors(expected, signal=expected).error[0] == pytest.approx(1.0, abs=0.06)
+    assert values.std() / binned.with_errors(expected, signal=expected).error[0] == pytest.approx(1.0, abs=0.06)
     assert trial.sample_modes[0] < 0.75 * trial.n_modes[0]
 
 
@@ -287,7 +287,7 @@ def test_the_error_of_the_difference_is_the_scatter_where_the_signal_is_common(n
     assert filled.all()
     scatter = np.std(total - sky, axis=0)
     expected = dataclasses.replace(trial, power=np.ones_like(trial.power))
-    predicted = errors.with_errors(trial, noise=np.sqrt(0.5), signal=expected).difference_error
+    predicted = binned.with_errors(trial, noise=np.sqrt(0.5), signal=expected).difference_error
     # 2000 trials give each standard deviation to 1.6 %; limits are four times that.
     np.testing.assert_allclose(scatter / predicted, 1.0, atol=0.065)
     assert np.mean(scatter / predicted) == pytest.approx(1.0, abs=0.04)
@@ -297,8 +297,8 @@ def test_polarizations_share_the_signal_not_the_noise():
     spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
     two = dataclasses.replace(spectra, n_polarizations=2)
     bins = np.zeros((3, 16), dtype=int)
-    np.testing.assert_allclose(errors.noise_modes(two, bins, 1), 2 * errors.noise_modes(spectra, bins, 1))
-    np.testing.assert_allclose(errors.sample_modes(two, bins, 1), errors.sample_modes(spectra, bins, 1))
+    np.testing.assert_allclose(binned.noise_modes(two, bins, 1), 2 * binned.noise_modes(spectra, bins, 1))
+    np.testing.assert_allclose(binned.sample_modes(two, bins, 1), binned.sample_modes(spectra, bins, 1))
 
 
 def test_errors_need_the_same_bins():
@@ -307,7 +307,7 @@ def test_errors_need_the_same_bins():
     other = spherical_average(spectra, PowerSettings(), False)
     assert np.isnan(first.error).all()
     with pytest.raises(ValueError, match="other bins"):
-        errors.with_errors(first, signal=other)
+        binned.with_errors(first, signal=other)
 
 
 def test_noise_power_from_visibilities_has_its_known_level(observe, white, beam):
@@ -321,14 +321,14 @@ def test_noise_power_from_visibilities_has_its_known_level(observe, white, beam)
     for pairs in ("same-baseline", "redundant-group"):
         rng, settings = np.random.default_rng(31), PowerSettings(pairs=pairs)
         uvp = estimate_power(white(template, rng, 7.0), white(template, rng, 7.0), beam, settings)
-        level = errors.noise_level(delay_spectra(uvp, settings))
+        level = binned.noise_level(delay_spectra(uvp, settings))
         assert level == pytest.approx(p_noise / np.sqrt(2), rel=0.08)
 
 
 def test_tables_come_back(tmp_path):
     rng = np.random.default_rng(2)
     spectra = make_spectra(rng.normal(size=(6, 16)) + 0j, rng.normal(size=(6, 3)) * 20)
-    spherical = errors.with_errors(spherical_average(spectra, SETTINGS, True), noise=2.0)
+    spherical = binned.with_errors(spherical_average(spectra, SETTINGS, True), noise=2.0)
     wedge = cylindrical_average(spectra, SETTINGS)
     for name, spectrum in (("s.h5", spherical), ("w.h5", wedge)):
         save_spectrum(tmp_path / name, spectrum)

@@ -14,8 +14,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.instrument.array_layouts.geometric import GolombLayout
 from calstudy.power.average import average_in_blocks, divide, fringe_stop_and_average
-from calstudy.power.binned import modes_in_bins, spherical_average
-from calstudy.power.errors import independent_times, noise_level, sample_modes
+from calstudy.power.binned import independent_times, modes_in_bins, noise_level, sample_modes, spherical_average
 from calstudy.power.interface import estimate_spectra
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra

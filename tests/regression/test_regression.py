@@ -17,7 +17,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.cli.main import app
 from calstudy.experiment.files import load, override
-from calstudy.regression.comparison import (
+from calstudy.regression import (
     Regression,
     accept,
     compare_array,

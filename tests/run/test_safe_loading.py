@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calstudy.base.errors import InputError
-from calstudy.experiment.yaml_files import parse_yaml
+from calstudy.experiment.files import parse_yaml
 from calstudy.run.store import RECORD, Store
 
 KEY = "0" * 32

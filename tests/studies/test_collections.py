@@ -21,7 +21,7 @@ from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.products import corruption, simulation
 from calstudy.products.spectra import power
-from calstudy.regression.comparison import accept
+from calstudy.regression import accept
 from calstudy.run.execution import schedule
 from calstudy.run.store import Store
 from calstudy.studies.kinds.collection import Collection, with_finished

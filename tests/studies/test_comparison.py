@@ -17,7 +17,7 @@ from calstudy.power.transfer import TransferFunction
 from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.products.signal_loss import transfer
-from calstudy.regression.comparison import accept, compare_figures, read_reference, read_run
+from calstudy.regression import accept, compare_figures, read_reference, read_run
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 

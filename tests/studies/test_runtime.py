@@ -14,8 +14,7 @@ from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.claims.evaluation import evaluate_folder
-from calstudy.claims.run_times import machine_in_words
-from calstudy.products.run_times import Descent, StepTimes
+from calstudy.products.run_times import Descent, StepTimes, machine_in_words
 from calstudy.studies.kinds import runtime
 from calstudy.studies.kinds.runtime import RuntimeStudy
 from calstudy.studies.load import load_study

@@ -14,8 +14,7 @@ from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.problem import make_structure
 from calstudy.corrupt.levels import rms
 from calstudy.instrument.telescope import make_template
-from calstudy.validation.single_integration import SingleIntegration
-from calstudy.validation.steps.degeneracies import EXCHANGES, best_misfit, narrow_model
+from calstudy.validation.steps.single_fit import EXCHANGES, SingleIntegration, best_misfit, narrow_model
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from calstudy.base.errors import InputError
 from calstudy.claims.bins import clustered_mean, pooled
 from calstudy.power.spectra import DelaySpectra
 from calstudy.validation.ladder import SCALES, passed, tally
-from calstudy.validation.steps.steep_signal import windowed
+from calstudy.validation.steps.estimator import windowed
 from calstudy.verdicts.criterion import Finding
 
 DRAWN = True

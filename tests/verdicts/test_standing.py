@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from calstudy.verdicts.measured import why_not_measured
-from calstudy.verdicts.standing import advice, standing_table, standings
+from calstudy.verdicts.standing import advice, standing_table, standings, why_not_measured
 
 WORLDS = ("ideal", "sources missing")
 

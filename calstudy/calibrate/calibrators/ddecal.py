@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from pydantic import Field
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.gain_files import read_h5parm
 from calstudy.base.observation import Frame
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
@@ -215,7 +216,7 @@ def _empty(frame: Frame, n_times: int) -> UVData:
         freq_array=frame.frequencies,
         channel_width=float(np.diff(frame.frequencies).mean()),
         polarization_array=np.array([-5, -6, -7, -8]),
-        times=2459000.5 + np.arange(n_times) * INTERVAL / 86400,
+        times=2459000.5 + np.arange(n_times) * INTERVAL / SECONDS_PER_DAY,
         antpairs=pairs,
         telescope=telescope,
         integration_time=INTERVAL,

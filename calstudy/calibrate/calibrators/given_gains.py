@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import FileName, require_inside
 from calstudy.base.gain_files import read_gain_file, read_gains
@@ -24,13 +25,14 @@ from calstudy.base.gains import require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import FOLDER, UNKEYED, Section, fault
+from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress, Solve
+from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal
 
-SECONDS_PER_DAY = 86400.0
 MANIFEST = "manifest.json"
 GAINS_SUFFIXES = (".calh5", ".calfits", ".cal", ".h5", ".fits", ".bin")
 """CalH5, calfits, a CASA table, H5Parm, and files of hyperdrive and calibrate."""
@@ -131,9 +133,6 @@ class ByFile(Calibrator):
     def _model(self, observation: Observation) -> np.ndarray | None:
         if self.model is None:
             return None
-        from calstudy.base.visibilities import to_cube
-        from calstudy.calibrate.sky_model import read_sky_model
-
         return to_cube(read_sky_model(self.model, observation.uvd))
 
 

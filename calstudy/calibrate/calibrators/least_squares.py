@@ -8,6 +8,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import Cost
+from calstudy.calibrate.basis import require_room
 from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_memory
 from calstudy.calibrate.interface import Assumed, Calibration, Progress, SolvePlan
 from calstudy.calibrate.problem import fitted_baselines, make_structure, repeat_structure
@@ -83,8 +84,6 @@ class _LeastSquares(GainFit):
 
 def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
     """Raise InputError if the channels cannot hold the foreground basis of the longest baseline."""
-    from calstudy.calibrate.basis import require_room
-
     longest = frame.lengths.max()
     try:
         require_room(longest, frame.frequencies, settings.basis)

@@ -16,6 +16,7 @@ from calstudy.calibrate.boards import Boards
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Assumed, Calibration, Progress, Solve
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
+from calstudy.calibrate.records import require_parallel_hands
 from calstudy.calibrate.settings import RUNAWAY, GainWeights, WeightedFit, unsettled_message
 from calstudy.instrument.settings import Size
 
@@ -81,7 +82,6 @@ class OtherPackage(WeightedFit):
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Solve every polarization, and flag the gains of antennas and channels without data."""
-        from calstudy.calibrate.records import require_parallel_hands
         from calstudy.calibrate.weights import make_weights
 
         if assumed.sky_model is None:

@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from pydantic import Field
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import gains_for
 from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Fraction, Frequency, Time
 from calstudy.base.visibilities import antenna_rows
-from calstudy.corrupt.drift import SECONDS_PER_DAY, Antennas, Polynomial, Shape, is_named, refusal_of_antennas
+from calstudy.corrupt.drift import Antennas, Polynomial, Shape, is_named, refusal_of_antennas
 from calstudy.corrupt.interface import GainEffect
 
 if TYPE_CHECKING:

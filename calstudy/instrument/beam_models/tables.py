@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from calstudy.base.package_files import PackageFile
 from calstudy.instrument.beam_frequencies import choose_frequencies, mwa_frequencies
 from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
 from calstudy.instrument.settings import Channels
-
-if TYPE_CHECKING:
-    import numpy as np
 
 HERA_FILES = {
     "fagnoni": PackageFile("hera_pspec", "data/HERA_NF_efield.beamfits"),

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from calstudy.claims.bins import difference_of_losses
-from calstudy.claims.run_times import RunTimes
 from calstudy.papers.calamity2022.method import HUNDREDTH, K_WINDOW
-from calstudy.products.run_times import PowerLaw, fit_power_law
+from calstudy.products.run_times import PowerLaw, RunTimeTable, fit_power_law
 from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
@@ -29,13 +28,13 @@ AROUND_HUNDRED = 100
 HALF_ORDER = 10**0.5
 
 
-def _paper_solve(run: RunTimes, antennas: int) -> Finding:
+def _paper_solve(run: RunTimeTable, antennas: int) -> Finding:
     """Return the seconds of the paper's solver on the GPU for so many antennas; a bound if its steps are."""
     law, steps = run.scaling("rows", "paper-step", device="gpu"), run.steps_to("0.01")
     return steps._replace(value=steps.value * float(law.at(antennas)))
 
 
-def _default_solve(run: RunTimes, antennas: int) -> Finding:
+def _default_solve(run: RunTimeTable, antennas: int) -> Finding:
     """Return the seconds of the default solver for so many antennas, with the error of the exponent."""
     law = run.scaling("rows", "default-solve")
     seconds = float(law.at(antennas))
@@ -57,14 +56,14 @@ QUADRATIC_SENTENCE = Sentence(
     QUADRATIC,
     QUARTER_WHY,
 )
-def paper_step_quadratic_in_antennas(run: RunTimes) -> Finding:
+def paper_step_quadratic_in_antennas(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("rows", "paper-step"))
 
 
 @COMPUTATION.states(
     QUADRATIC_SENTENCE, "the same of this project's own Adamax step, without padding", QUADRATIC, QUARTER_WHY
 )
-def own_step_quadratic_in_antennas(run: RunTimes) -> Finding:
+def own_step_quadratic_in_antennas(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("rows", "adamax-step"))
 
 
@@ -80,7 +79,7 @@ LINEAR_SENTENCE = Sentence(
     LINEAR,
     QUARTER_WHY,
 )
-def paper_step_linear_in_longest_baseline(run: RunTimes) -> Finding:
+def paper_step_linear_in_longest_baseline(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step"))
 
 
@@ -90,7 +89,7 @@ def paper_step_linear_in_longest_baseline(run: RunTimes) -> Finding:
     LINEAR,
     QUARTER_WHY,
 )
-def paper_step_linear_in_vectors(run: RunTimes) -> Finding:
+def paper_step_linear_in_vectors(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step", "vectors"))
 
 
@@ -100,7 +99,7 @@ def paper_step_linear_in_vectors(run: RunTimes) -> Finding:
     AtLeast(0.5),
     "more than all the rest",
 )
-def sum_dominates_step(run: RunTimes) -> Finding:
+def sum_dominates_step(run: RunTimeTable) -> Finding:
     return Finding(float(run.medians("rows", "paper-sum")[-1] / run.medians("rows", "paper-step")[-1]), 0.0)
 
 
@@ -113,7 +112,7 @@ MEMORY_SENTENCE = Sentence("memory", "memory use is dominated by the N_vec N_fre
     AtLeast(0.5),
     "more than all the rest",
 )
-def basis_dominates_memory(run: RunTimes) -> Finding:
+def basis_dominates_memory(run: RunTimeTable) -> Finding:
     return Finding(float(run.column("rows", "basis_bytes")[-1] / run.column("rows", "paper_memory")[-1]), 0.0)
 
 
@@ -123,7 +122,7 @@ def basis_dominates_memory(run: RunTimes) -> Finding:
     LINEAR,
     QUARTER_WHY,
 )
-def memory_grows_like_basis(run: RunTimes) -> Finding:
+def memory_grows_like_basis(run: RunTimeTable) -> Finding:
     return _exponent(fit_power_law(run.column("rows", "basis_bytes"), run.column("rows", "paper_memory")))
 
 
@@ -137,14 +136,14 @@ THOUSANDS, THOUSANDS_WHY = Within(1e3, 1e4), "thousands, not hundreds or tens of
 @COMPUTATION.states(
     THOUSANDS_SENTENCE, "steps until the loss is within 5 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
 )
-def thousands_of_steps_to_five_percent(run: RunTimes) -> Finding:
+def thousands_of_steps_to_five_percent(run: RunTimeTable) -> Finding:
     return run.steps_to("0.05")
 
 
 @COMPUTATION.states(
     THOUSANDS_SENTENCE, "steps until the loss is within 1 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
 )
-def thousands_of_steps_to_one_percent(run: RunTimes) -> Finding:
+def thousands_of_steps_to_one_percent(run: RunTimeTable) -> Finding:
     return run.steps_to("0.01")
 
 
@@ -154,7 +153,7 @@ def thousands_of_steps_to_one_percent(run: RunTimes) -> Finding:
     AtLeast(30),
     "the paper's factor",
 )
-def gpu_thirty_times_faster(run: RunTimes) -> Finding:
+def gpu_thirty_times_faster(run: RunTimeTable) -> Finding:
     on_gpu = run.medians("rows", "paper-step", "gpu")[-1]
     return Finding(float(run.medians("rows", "paper-step")[-1] / on_gpu), 0.0)
 
@@ -165,7 +164,7 @@ def gpu_thirty_times_faster(run: RunTimes) -> Finding:
     Within(0.02 / HALF_ORDER, 0.03 * HALF_ORDER),
     "20 to 30 ms, to half an order of magnitude either way",
 )
-def gpu_step_at_hundred_antennas(run: RunTimes) -> Finding:
+def gpu_step_at_hundred_antennas(run: RunTimeTable) -> Finding:
     closest = int(np.argmin(np.abs(run.column("rows", "antennas", "gpu") - AROUND_HUNDRED)))
     return Finding(float(run.medians("rows", "paper-step", "gpu")[closest]), 0.0)
 
@@ -176,7 +175,7 @@ def gpu_step_at_hundred_antennas(run: RunTimes) -> Finding:
     CONSTANT,
     QUARTER_WHY,
 )
-def gpu_step_constant_in_longest_baseline(run: RunTimes) -> Finding:
+def gpu_step_constant_in_longest_baseline(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step", device="gpu"))
 
 
@@ -192,7 +191,7 @@ MINUTES_SENTENCE = Sentence(
     MINUTES,
     MINUTES_WHY,
 )
-def paper_solve_in_minutes(run: RunTimes) -> Finding:
+def paper_solve_in_minutes(run: RunTimeTable) -> Finding:
     return _paper_solve(run, HUNDREDS)
 
 
@@ -202,7 +201,7 @@ def paper_solve_in_minutes(run: RunTimes) -> Finding:
     MINUTES,
     MINUTES_WHY,
 )
-def default_solve_in_minutes(run: RunTimes) -> Finding:
+def default_solve_in_minutes(run: RunTimeTable) -> Finding:
     return _default_solve(run, HUNDREDS)
 
 
@@ -215,7 +214,7 @@ HOURS_SENTENCE = Sentence("within-hours", "and for thousands of element arrays o
     HOURS,
     HOURS_WHY,
 )
-def paper_solve_of_thousands_in_hours(run: RunTimes) -> Finding:
+def paper_solve_of_thousands_in_hours(run: RunTimeTable) -> Finding:
     return _paper_solve(run, THOUSANDS_OF_ANTENNAS)
 
 
@@ -225,7 +224,7 @@ def paper_solve_of_thousands_in_hours(run: RunTimes) -> Finding:
     HOURS,
     HOURS_WHY,
 )
-def default_solve_of_thousands_in_hours(run: RunTimes) -> Finding:
+def default_solve_of_thousands_in_hours(run: RunTimeTable) -> Finding:
     return _default_solve(run, THOUSANDS_OF_ANTENNAS)
 
 
@@ -243,7 +242,7 @@ CRITICAL_WHY = "without it ten minutes at least, which would still be minutes"
     AtLeast(MINUTES.bound),
     CRITICAL_WHY,
 )
-def gpu_critical_for_paper_solver(run: RunTimes) -> Finding:
+def gpu_critical_for_paper_solver(run: RunTimeTable) -> Finding:
     closest = int(np.argmin(np.abs(run.column("rows", "antennas") - run.table["descent"]["antennas"])))
     steps = run.steps_to("0.01")
     return steps._replace(value=steps.value * float(run.medians("rows", "paper-step")[closest]))
@@ -255,7 +254,7 @@ def gpu_critical_for_paper_solver(run: RunTimes) -> Finding:
     AtLeast(MINUTES.bound),
     CRITICAL_WHY,
 )
-def gpu_critical_for_default_solver(run: RunTimes) -> Finding:
+def gpu_critical_for_default_solver(run: RunTimeTable) -> Finding:
     return Finding(float(run.medians("rows", "default-solve")[-1]), 0.0)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calstudy.power.interface import Estimator, PowerBeam
 from calstudy.power.spectra import DelaySpectra, delay_spectra
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pyuvdata import UVData
 
     from calstudy.power.settings import PowerSettings

@@ -16,7 +16,8 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.resources import Cost
-from calstudy.base.visibilities import antenna_indices, require_rectangular
+from calstudy.base.visibilities import antenna_indices, require_rectangular, use_bundled_earth_orientation
+from calstudy.instrument.interface import AntennaBeams
 from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
 from calstudy.simulate.nodes import integration_times
 
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from pyuvdata import BeamInterface, UVBeam, UVData
     from pyuvdata.analytic_beam import AnalyticBeam
     from pyuvsim.simsetup import SkyModelData
-
-    from calstudy.instrument.interface import AntennaBeams
 
 
 # matvis splits its sources so that a block takes about this much memory (bytes).
@@ -111,7 +110,6 @@ def call(
     from astropy.coordinates import ICRS
     from astropy.time import Time
 
-    from calstudy.base.visibilities import use_bundled_earth_orientation
     from calstudy.instrument.antenna_beams import split_beams
     from calstudy.simulate.sources import sky_coordinates
 
@@ -188,8 +186,6 @@ class FftvisEngine(Engine):
 
     def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
-        from calstudy.instrument.interface import AntennaBeams
-
         if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
             return "fftvis confuses the feeds of cross-hand polarizations if antennas have different beams"
         return refusal("fftvis", sky, beam, template)
@@ -266,8 +262,6 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
     from pyuvdata import BeamInterface
     from pyuvsim import BeamList
     from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
-
-    from calstudy.base.visibilities import use_bundled_earth_orientation
 
     use_bundled_earth_orientation()
     listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])

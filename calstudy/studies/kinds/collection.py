@@ -20,9 +20,8 @@ from calstudy.base.identity import identity
 from calstudy.base.schema import Section, fault
 from calstudy.claims.evaluation import combined_claims, members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
-from calstudy.experiment.files import StudyFile, apply_scale, checked, override, validate
+from calstudy.experiment.files import StudyFile, apply_scale, checked, override, read_mapping, validate
 from calstudy.experiment.model import Experiment, Figures, StudyName
-from calstudy.experiment.yaml_files import read_mapping
 from calstudy.figures import StudyFigure, figure_task, figures_for
 from calstudy.results.reader import MANIFEST, RunFolder
 from calstudy.run.store import Product, Store

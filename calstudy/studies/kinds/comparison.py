@@ -21,9 +21,17 @@ from calstudy.base.schema import Section, fault
 from calstudy.calibrate.calibrators.given_gains import salted
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.claims.paper import stand_ins
-from calstudy.experiment.files import StudyFile, apply_scale, checked, dump, override, parse_override, validate
+from calstudy.experiment.files import (
+    StudyFile,
+    apply_scale,
+    checked,
+    dump,
+    override,
+    parse_override,
+    read_mapping,
+    validate,
+)
 from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment, Figures, StudyName
-from calstudy.experiment.yaml_files import read_mapping
 from calstudy.figures import StudyFigure, figures_for
 from calstudy.products import corruption, sky_model, tolerances
 from calstudy.products.comparison import case_name, comparison

@@ -28,9 +28,9 @@ from calstudy.base.units import Delay
 from calstudy.calibrate.settings import InitialGains, UnityStart
 from calstudy.corrupt.levels import rms
 from calstudy.plotting import style
-from calstudy.plotting.save import figure_arrays, save_figure
-from calstudy.validation.single_integration import SingleIntegration, SingleIntegrationStep
+from calstudy.plotting.style import figure_arrays, save_figure
 from calstudy.validation.step import Findings, Limit, StepInput
+from calstudy.validation.steps.single_fit import SingleIntegration, SingleIntegrationStep
 from calstudy.verdicts.criterion import AtMost, Finding
 
 if TYPE_CHECKING:

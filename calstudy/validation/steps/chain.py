@@ -1,4 +1,13 @@
-"""Step 4.1: the signal-loss budget: the part of the EoR that each stage removes, per band of k.
+"""Steps 4.0 and 4.1: the whole chain, from the sky to the power spectrum.
+
+Step 4.0: recovery of the EoR in each bin, from the sky to the power spectrum.
+
+Pulls (P^R - P^S) / sigma outside wedge and buffer are computed with two definitions of sigma: the paper's error bar
+sigma_N + sigma_S, and the error of the difference, without the sample variance that P^R and P^S share
+(`calstudy.power.spectra.SphericalSpectrum.difference_error`). The second is the more severe. P^R / P^S is reported as
+it is, and without the flux scale s of the fit, by whose square P^R is divided.
+
+Step 4.1: the signal-loss budget: the part of the EoR that each stage removes, per band of k.
 
 The spectrum of the EoR alone is followed through the chain, with each entry in units of the input:
 
@@ -29,6 +38,7 @@ import numpy as np
 
 from calstudy.base.table import Table
 from calstudy.base.visibilities import to_cube
+from calstudy.claims.bins import recovered, used_bins
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
 from calstudy.power.average import fringe_stop_and_average
@@ -41,7 +51,65 @@ from calstudy.products.files import DATA, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Findings, Limit, Step, StepInput, required
-from calstudy.verdicts.criterion import AtMost, Finding
+from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
+
+SIGMAS = 2
+EXPECTED = 0.954
+"""Fraction of a normal distribution within two sigma."""
+
+
+class EndToEnd(Step):
+    """The fraction of the bins of every experiment with a pull within two sigma, for both definitions of sigma."""
+
+    kind: str = "end-to-end"
+    number = "4.0"
+    proves = "P^R recovers P^S outside wedge and buffer, on both arrays"
+    experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
+    limits: ClassVar = {
+        "minredundant_bars": Limit(
+            "minimally redundant array, fraction of bins with |P^R - P^S| within 2 sigma; sigma of the paper (sigma_N "
+            "+ sigma_S)",
+            AtLeast(0.9),
+            "95 % are expected; 10 % may miss",
+        ),
+        "redundant_bars": Limit("redundant array, the same", AtLeast(0.9), "as above"),
+        "minredundant_difference": Limit(
+            "minimally redundant array, the same with the error of the difference, since both contain the same EoR",
+            AtLeast(0.9),
+            "as above; stricter, because the paper's error bars contain sample variance that both share",
+        ),
+        "redundant_difference": Limit("redundant array, the same", AtLeast(0.9), "as above"),
+    }
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the averaged spectra of all variants, and the transfer function, if any, which has the flux scale."""
+        transfer = signal_loss.transfer(graph)
+        return {"spectra": spectra.spectra(graph), **({} if transfer is None else {"transfer": transfer})}
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Compare the spectrum of the residual with that of the EoR."""
+        values, remarks = {}, []
+        for name, run in runs.items():
+            residual, signal = (run.spherical(variant, "outside-wedge") for variant in ("residual", "eor"))
+            used = used_bins(residual, signal)
+            difference = (residual.power - signal.power).real[used]
+            for reading, error in (("bars", residual.error), ("difference", residual.difference_error)):
+                within = np.abs(difference / error[used]) <= SIGMAS
+                sampling = np.sqrt(EXPECTED * (1 - EXPECTED) / within.size)
+                values[f"{name}_{reading}"] = Finding(float(within.mean()), float(sampling))
+            ratio = recovered(residual, signal, 0.0)
+            values[f"{name}_ratio"] = ratio
+            remarks.append(f"{name}: {_ratio_sentence(ratio, int(used.sum()), run.flux_scale)}")
+        return Findings(values, tuple(remarks))
+
+
+def _ratio_sentence(ratio: Finding, n_bins: int, scale: float | None) -> str:
+    text = f"P^R / P^S = {ratio.value:.3f} ± {ratio.uncertainty:.3f} in {n_bins} bins"
+    if scale is None:
+        return f"{text}; the flux scale is not known"
+    free = f"{scale**2 * ratio.value:.3f} ± {scale**2 * ratio.uncertainty:.3f}"
+    return f"{text}; without the flux scale, {scale:.3f}: {free}"
+
 
 STAGES = ("sky", "averaging", "fringe-stop", "taper", "calibration", "flux-scale", "mask", "left")
 
@@ -69,6 +137,7 @@ class Band:
 class SignalLossBudget(Step):
     """The largest pull of any band of k, for every experiment."""
 
+    kind: str = "signal-loss-budget"
     number = "4.1"
     proves = "the EoR losses of all stages add up to the end-to-end loss"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
@@ -108,13 +177,13 @@ class SignalLossBudget(Step):
             ]
             worst = max(bands, key=lambda band: abs(band.pull))
             values[f"{name}_worst_pull"] = Finding(abs(worst.pull), 1.0)
-            remarks += [f"{name}: {_sentence(band)}" for band in bands]
+            remarks += [f"{name}: {_band_sentence(band)}" for band in bands]
         columns = ("experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error")
         Table(columns, rows).write_csv(output / "signal_loss_budget.csv")
         return Findings(values, tuple(remarks))
 
 
-def _sentence(band: Band) -> str:
+def _band_sentence(band: Band) -> str:
     parts = ", ".join(f"{stage} {100 * loss:.1f} %" for stage, loss in zip(STAGES, band.losses, strict=True))
     return (
         f"k from {band.low:g} to {band.high:g} h/Mpc: {parts}; sum {100 * band.total:.1f} %, end to end "

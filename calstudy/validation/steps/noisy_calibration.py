@@ -1,4 +1,6 @@
-"""Step 2.3: flagged samples must have no influence, and the others must be calibrated without bias.
+"""Steps 2.3 to 3.0: calibration of noisy data with flags, with errors of its gains, and of effects below the noise.
+
+Step 2.3: flagged samples must have no influence, and the others must be calibrated without bias.
 
 *influence*: the data are calibrated twice, with different values under the flags; the largest difference of any gain,
 model or residual must be exactly zero.
@@ -6,6 +8,13 @@ model or residual must be exactly zero.
 *bias*: foregrounds and noise are calibrated for two realizations of the noise. The part that both residuals share is
 not noise: the mean of Re R_even* R_odd over unflagged samples, in units of its standard error (each baseline one
 sample), is the residual of the foregrounds due to gain errors.
+
+Step 2.4: as many gains are within their errors of the true ones as should be.
+
+Deviations from the true gains, without what no fit can know, in units of their errors by noise; both noise realizations
+of every integration are realizations of the noise.
+
+Step 3.0: reflections below the noise of a baseline, which the calibration must remove.
 """
 
 from __future__ import annotations
@@ -18,20 +27,24 @@ import numpy as np
 from pydantic import Field
 from pyuvdata import UVData
 
+from calstudy.base.errors import InputError
 from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.records import CalibrationResult
-from calstudy.claims.bins import clustered_mean
+from calstudy.claims.bins import bins_at_delays, clustered_mean
+from calstudy.corrupt.effects.gains import ReflectionGains
 from calstudy.experiment.model import Variant
-from calstudy.products import corruption, simulation
+from calstudy.figures.gain_coverage import ALLOWED, PARTS, pooled
+from calstudy.products import corruption, simulation, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
+from calstudy.products.gain_errors import gain_coverage, read_coverage
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.single_integration import first_integrations
-from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only, required
-from calstudy.verdicts.criterion import AtMost, Finding
+from calstudy.validation.step import MINREDUNDANT, Case, Findings, Limit, Step, StepInput, only, required
+from calstudy.validation.steps.single_fit import first_integrations
+from calstudy.verdicts.criterion import AtMost, Finding, Within
 
 HUGE = 1e6
 
@@ -39,6 +52,7 @@ HUGE = 1e6
 class Flags(Step):
     """The largest influence, and the largest bias in sigma, of all patterns of flags."""
 
+    kind: str = "flags"
     number = "2.3"
     proves = "flagged data (single channels, bands, 30 % at random) have no influence, and the residual is unbiased"
     experiments: ClassVar = {"minredundant": MINREDUNDANT}
@@ -132,3 +146,114 @@ def bias(even: UVData, odd: UVData) -> Finding:
     samples = product.transpose(1, 0, 2, 3).reshape(product.shape[1], -1)
     found = clustered_mean(samples)
     return Finding(found.value / found.uncertainty, 1.0)
+
+
+VARIANT = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
+NAMES = ("within_1", "within_2")
+MANY = {"instrument.times.count": 20, "calibration.weights": "gains", "sky.eor.nside": 64}
+FEW = {"instrument.times.count": 12, "calibration.weights": "gains"}
+
+FAILING = (
+    "errors that are 7 % too small or too large fail",
+    "errors that are 8 % too small or 11 % too large fail",
+)
+"""What the limits find, for 1 and 1.96 errors."""
+
+
+class GainErrors(Step):
+    """The fractions of amplitudes and phases within 1 and 1.96 errors, of `calamity`."""
+
+    kind: str = "gain-errors"
+    number = "2.4"
+    proves = "the errors of the gains by noise cover the deviations from the true gains"
+    # The member calamity of gain-errors.yaml, whose products it has.
+    experiments: ClassVar = {"calamity": Case("minredundant.yaml", MANY, small=FEW)}
+    limits: ClassVar = {
+        f"{part}_{name}": Limit(
+            f"fraction of the {part}s of all gains within {sigmas} sigma",
+            Within(right - allowed, right + allowed),
+            f"{100 * right:.3g} % of a normal distribution; {why}",
+        )
+        for part in PARTS
+        for name, sigmas, (right, allowed), why in zip(NAMES, ("1", "1.96"), ALLOWED, FAILING, strict=True)
+    }
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the fractions of both noise realizations."""
+        return {parity: gain_coverage(graph, VARIANT, parity) for parity in PARITIES}
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Pool the realizations."""
+        run = only(runs)
+        found = pooled([read_coverage(run.products[parity]) for parity in PARITIES])
+        values = {
+            f"{part}_{name}": Finding(float(found.within[place, limit]), float(found.within_error[place, limit]))
+            for place, part in enumerate(PARTS)
+            for limit, name in enumerate(NAMES)
+        }
+        worst = ", ".join(f"{100 * value:.1f}" for value in found.worst.ravel())
+        remark = f"{found.realizations} realizations; of the worst antenna {worst} %"
+        return Findings(values, (remark,))
+
+
+SUPPRESSION = 100
+NOISE_SIGMAS = 2
+WIDTH = 2
+"""Reflections are searched for within this many standard deviations of their mean delay."""
+
+
+SMALL = {
+    "corruption.noise": {"kind": "times-foregrounds", "factor": 0.1},
+    "corruption.effects": [
+        {"kind": "reflection-gains", "amplitude": 0.1, "delay": "800 ns", "delay_scatter": "50 ns", "seed": 5}
+    ],
+    "outputs.figures": [],
+}
+
+
+class LowSnr(Step):
+    """The remaining artefact at the reflections' delays, outside the wedge.
+
+    With means over those bins, weighted by their inverse noise variance, *left* is |P^R| over the larger of P^V / 100
+    and 2 sigma of the noise: one or less is suppression by 100, or to the noise.
+    """
+
+    kind: str = "low-snr"
+    number = "3.0"
+    proves = "cable reflections below the noise of a baseline are removed"
+    experiments: ClassVar = {"lowsnr": Case("lowsnr.yaml", small=SMALL)}
+    sections: ClassVar = ("corruption",)
+    limits: ClassVar = {
+        "left": Limit(
+            "|P^R| at the reflections over the larger of P^V / 100 and 2 sigma of the noise",
+            AtMost(1),
+            "suppressed by 100, or to the noise",
+        ),
+    }
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the averaged spectra of all variants."""
+        return {"spectra": spectra.spectra(graph)}
+
+    def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
+        """Compare the spectra before and after calibration."""
+        run = only(runs)
+        corrupted, residual = (run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual"))
+        gains = run.experiment.corruption.gains
+        if not isinstance(gains, ReflectionGains):
+            raise InputError("the measurement needs an experiment with the effect reflection-gains")
+        low, high = (gains.delay + sign * WIDTH * gains.delay_scatter for sign in (-1, 1))
+        chosen = bins_at_delays(residual, run.wedge("noise"), low, high)
+        weights = residual.noise_error[chosen] ** -2.0
+        artefact, left = (
+            float(np.sum(weights * spectrum.power.real[chosen]) / weights.sum()) for spectrum in (corrupted, residual)
+        )
+        sigma = float(weights.sum() ** -0.5)
+        allowed = max(abs(artefact) / SUPPRESSION, NOISE_SIGMAS * sigma)
+        values = {
+            "left": Finding(abs(left) / allowed, sigma / allowed),
+            "left_sigmas": Finding(left / sigma, 1.0),
+            "artefact_sigmas": Finding(artefact / sigma, 1.0),
+        }
+        remark = f"artefact {artefact / sigma:.1f} sigma of the noise before calibration, {left / sigma:.1f} after"
+        return Findings(values, (remark,))

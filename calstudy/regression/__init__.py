@@ -1,1 +1,0 @@
-"""Regression: check that a study, made again, still gives its reference results."""
