@@ -46,7 +46,9 @@ class Recovered:
     measured, by_flat, unbiased
         Means over realizations, (Nk,), of P^R, P^R over T of a flat spectrum, and W^-1 P^R; NaN in bins without a
         result.
-    measured_error, by_flat_error, unbiased_error : their standard errors, by the scatter over realizations, (Nk,)
+    measured_error, by_flat_error, unbiased_error
+        Their standard errors, (Nk,): by the scatter over realizations of the difference from the power of the signal of
+        the same realization, so that they are free of its sample variance.
     within
         Fraction of the bins and realizations in which W^-1 P^R is within 1 and 1.96 of its errors of the mean power of
         the signals, (2,)
@@ -75,7 +77,10 @@ def recovered(found: Sequence[UnbiasedSpectrum]) -> Recovered:
     pulls = np.array([(one.power - truth) / one.error for one in found])
     known = np.isfinite(pulls)
     means = {name: values.mean(axis=0) for name, values in routes.items()}
-    errors = {f"{name}_error": values.std(axis=0, ddof=1) / np.sqrt(len(found)) for name, values in routes.items()}
+    own = np.array([one.signal / truth for one in found])
+    errors = {
+        f"{name}_error": (values - own).std(axis=0, ddof=1) / np.sqrt(len(found)) for name, values in routes.items()
+    }
     for values in (*means.values(), *errors.values()):
         values[~known.all(axis=0)] = np.nan
     within = np.array([np.mean(np.abs(pulls[known]) < limit) for limit in WITHIN])

@@ -457,7 +457,6 @@ def test_what_is_not_the_papers_study_plays_no_role_of_it(tmp_path, changes, rea
             for change, reason in (
                 ({"keep": "best"}, "keep is 'best', not the paper's 'last'"),
                 ({"precision": "double"}, "precision is 'double'"),
-                ({"warm_start": True}, "warm_start is True"),
                 ({"max_steps": 2000}, "max_steps is 2000"),
                 ({"tolerance": 1e-14}, "tolerance is 1e-14: it takes a fixed number of steps"),
             )
