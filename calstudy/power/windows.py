@@ -103,7 +103,7 @@ class BinSignals:
 
 
 def window_matrix(
-    modes: BaselineModes, left: tuple[np.ndarray, np.ndarray], norm: float, edges: np.ndarray, buffer: float
+    modes: BaselineModes, left: tuple[np.ndarray, np.ndarray], put_in: np.ndarray, edges: np.ndarray, buffer: float
 ) -> np.ndarray:
     """Return W, (Nk, Nk), NaN in rows of bins without modes outside the wedge.
 
@@ -113,16 +113,18 @@ def window_matrix(
     left
         Amplitudes of what two fits, to data with independent noise, leave of the signals of each bin, complex,
         (Ndraws, Nk, Nbls, Ndelays).
-    norm : power of such an amplitude for a signal with a mean square of one per channel
+    put_in
+        Power of the amplitudes of the signals themselves, of all bins together, mean over draws, (Nbls, Ndelays): what
+        is left is measured against it, free of the sample variance of the signals.
     edges, buffer : as in `calstudy.power.expected.bin_response`
     """
     n_bins = edges.size - 1
     bins, used = bins_outside(modes, edges, buffer)
     even, odd = left
     power = np.mean((even.conj() * odd).real, axis=0)
-    count = np.bincount(bins[used], minlength=n_bins)
+    whole = np.bincount(bins[used], put_in[used], n_bins)
     sums = np.array([np.bincount(bins[used], part[used], n_bins) for part in power]).T
-    return sums / np.where(count > 0, count, np.nan)[:, None] / norm
+    return sums / np.where(whole > 0, whole, np.nan)[:, None]
 
 
 def deconvolved(window: np.ndarray, power: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

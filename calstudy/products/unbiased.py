@@ -68,13 +68,15 @@ class BinResponse(Solved, stage="bin-response", version=1):
             signals = BinSignals(*where, window_edges(self.power), self.power.cosmology)
             modes, rng = DelayModes(solution.frequency, self.power.taper), np.random.default_rng(SEED)
             fit = solution.problem, solution.gains, solution.model
-            left = [[modes.amplitudes(response_to(*fit, signal)) for signal in signals.draw(rng)] for _ in range(DRAWS)]
+            drawn = [list(signals.draw(rng)) for _ in range(DRAWS)]
+            left = [[modes.amplitudes(response_to(*fit, signal)) for signal in parts] for parts in drawn]
+            powers = [np.abs(modes.amplitudes(signal)) ** 2 for parts in drawn for signal in parts]
             arrays = {
                 "left": np.array(left, np.complex64),
+                "put_in": np.sum(powers, axis=0) / DRAWS,
                 "delay": modes.delay,
                 "lengths": solution.lengths,
                 "centre": solution.frequency.mean(),
-                "norm": np.sum(modes.weights**2),
             }
         np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
         return {}
@@ -109,7 +111,7 @@ class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
                 raise InputError("unbiased: the middle integration has antennas or channels without gains")
             modes = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
             both = even["left"], odd["left"]
-            window = window_matrix(modes, both, float(even["norm"]), edges, self.power.wedge_buffer)
+            window = window_matrix(modes, both, even["put_in"], edges, self.power.wedge_buffer)
         residual, signal = (
             load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
             for name in ("residual", "eor")

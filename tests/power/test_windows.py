@@ -37,8 +37,10 @@ def where(modes):
 def windows(modes, where, keep, draws=40):
     """W of a calibration that leaves `keep` of a signal, a function of (Nbls, Nfreqs)."""
     rng, drawn = np.random.default_rng(1), signals()
-    left = np.array([[modes.amplitudes(keep(one)) for one in drawn.draw(rng)] for _ in range(draws)])
-    return window_matrix(where, (left, left), float(np.sum(modes.weights**2)), EDGES, BUFFER)
+    parts = [list(drawn.draw(rng)) for _ in range(draws)]
+    left = np.array([[modes.amplitudes(keep(one)) for one in found] for found in parts])
+    put_in = np.sum(np.abs([modes.amplitudes(one) for found in parts for one in found]) ** 2, axis=0) / draws
+    return window_matrix(where, (left, left), put_in, EDGES, BUFFER)
 
 
 def delay_filter(modes, factor):
@@ -47,12 +49,18 @@ def delay_filter(modes, factor):
     return lambda values: np.fft.fft(np.fft.ifft(values, axis=1) * grid, axis=1)
 
 
+def test_signals_of_all_bins_are_white_with_a_mean_square_of_one():
+    power = [np.abs(np.sum(list(signals().draw(np.random.default_rng(seed))), axis=0)) ** 2 for seed in range(20)]
+    # Of 20 draws of 40 baselines and 96 channels, and of each channel.
+    assert np.mean(power) == pytest.approx(1, abs=4 / np.sqrt(20 * 40 * 96))
+    assert np.mean(power, axis=(0, 1)) == pytest.approx(1, abs=4.5 / np.sqrt(20 * 40))
+
+
 def test_without_loss_windows_add_up_to_one(modes, where):
     window = windows(modes, where, lambda signal: signal)
     # The first bin has no modes outside the wedge.
     assert np.isnan(window[0]).all()
-    # Bins have some hundred independent modes in 40 draws.
-    assert window[1:].sum(axis=1) == pytest.approx(1, abs=0.05)
+    assert window[1:].sum(axis=1) == pytest.approx(1, rel=1e-6)
     # The taper mixes neighbours alone.
     far = np.abs(np.subtract.outer(np.arange(6), np.arange(6))) > 1
     assert window[1:][far[1:]].max() < 1e-3
@@ -84,12 +92,13 @@ def test_a_steep_spectrum_comes_back_where_a_flat_transfer_function_misses_it(mo
     window = windows(modes, where, keep)
     # The first bin, without modes outside the wedge, is taken to have the power of the second.
     truth = (np.maximum(EDGES[1:] + EDGES[:-1], 0.3) / 2 / 0.3) ** -2.5
+    white = np.full((LENGTHS.size, modes.delay.size), np.sum(modes.weights**2))
     rng, total, draws = np.random.default_rng(5), np.zeros(6), 60
     for _ in range(draws):
         parts = [np.sqrt(power) * one for power, one in zip(truth, signals().draw(rng), strict=True)]
         left = modes.amplitudes(keep(np.sum(parts, axis=0)))[None, None]
         ones = np.repeat(left, 6, axis=1)
-        total += window_matrix(where, (ones, ones), float(np.sum(modes.weights**2)), EDGES, BUFFER)[:, 0] / draws
+        total += window_matrix(where, (ones, ones), white, EDGES, BUFFER)[:, 0] / draws
     found, error = deconvolved(window, total, 0.01 * total)
     assert np.isnan(found[0])
     # Scatter of the draws, in the windows and in the signal.
