@@ -21,6 +21,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
+SELECTED = "not slow and not notebook"
+"""Tests of whole studies, too."""
+
 
 @dataclass(frozen=True)
 class Mutation:
@@ -331,7 +334,7 @@ def _pass(tests: tuple[str, ...], mutation: Mutation | None) -> bool:
         if mutation is not None:
             path = mutation.place(folder)
             path.write_text(path.read_text("utf-8").replace(mutation.old, mutation.new), encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", SELECTED, *tests]
         environment = {**os.environ, "PYTHONPATH": str(folder)}
         return subprocess.run(command, cwd=folder, env=environment, capture_output=True, check=False).returncode == 0
 

@@ -30,6 +30,7 @@ from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, so
 
 SEARCH_TOLERANCE = 1e-3
 """Of solves from which a deviation is estimated that is not the last."""
+NO_EXACT_SOLVE = "only solves with the tolerance of the search for the deviation gave gains"
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 UNRESOLVED_DEVIATION = (
     "the deviation of the foregrounds from the sky model is lost in rounding; "
@@ -177,13 +178,15 @@ class _Passes:
         current = self._for_pass(problem, gains, deviations)
         done: list[_Pass] = []
         found: Estimate | None = None
-        change, anew, settled = 0.0, True, False
+        change, anew, settled, exact = 0.0, True, False, self._search is self._solver
+        exact_before = exact
         while len(done) < self._most:
-            last = settled or len(done) == self._most - 1
-            solver = self._solver if last else self._search
-            solution, warm, anew = _solve(current, solver, warm, anew)
+            exact = exact or settled or len(done) == self._most - 1
+            solution, warm, anew = _solve(current, self._solver if exact else self._search, warm, anew)
             if done and not solution.record.usable:
-                break
+                # The gains of a rough solve are not those of the settings.
+                return self._kept(done, change, found, "" if exact_before else NO_EXACT_SOLVE)
+            exact_before = exact
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
             if not solution.record.usable:
                 break
@@ -195,7 +198,7 @@ class _Passes:
             settled = (self._weights is None or change < self._weights.tolerance) and (found is None or found.settled)
             # What follows from gains that are far from the solution leads away from it.
             far = solution.record.status == "max-steps" or not (found is None or found.resolved)
-            if far or (settled and solver is self._solver):
+            if far or (settled and exact):
                 break
         return self._kept(done, change, found)
 
@@ -205,10 +208,15 @@ class _Passes:
         found = problem if self._weights is None else problem.weighted_by(gains)
         return found if deviations is None else found.with_fractions(deviations)
 
-    def _kept(self, done: Sequence[_Pass], change: float, found: Estimate | None) -> _Pass:
-        """Return the last pass, or the first where weights run away, with what all passes say in its record."""
+    def _kept(self, done: Sequence[_Pass], change: float, found: Estimate | None, fault: str = "") -> _Pass:
+        """Return the last pass, or the first where weights run away, with what all passes say in its record.
+
+        A `fault` makes a converged pass a stalled one.
+        """
         kept = done[0 if len(done) > 1 and change > RUNAWAY else -1]
         record = _together([one.solution.record for one in done])
+        if fault and record.status == "converged":
+            record = replace(record, status="stalled", message=fault)
         if self._weights is not None and self._weights.unsettled(change) and record.status == "converged":
             record = replace(record, status="max-steps", message=unsettled_message(change, len(done)))
         notes: dict[str, Any] = {"passes": len(done)}

@@ -298,7 +298,8 @@ class Spherical(StudyFigure):
         if self.limits is None:
             return self.caption
         sources = dict.fromkeys(f"{limits.name} ({limits.reference})" for limits in read_limits(self.limits))
-        return f"{self.caption} Dotted: upper limits near this redshift, of {'; '.join(sources)}."
+        dotted = "Dotted: upper limits near this redshift, if there are some, of a table from"
+        return f"{self.caption} {dotted} {'; '.join(sources)}."
 
     def drawn(self, columns: Mapping[str, SphericalColumn], job: Job) -> Drawing:
         """Draw the columns with the limits."""

@@ -16,9 +16,8 @@ from calstudy.plotting import style
 from calstudy.power.tables import load_spectrum
 from calstudy.power.windows import UnbiasedSpectrum
 from calstudy.products.comparison import case_name
-from calstudy.products.expected_loss import why_no_response
 from calstudy.products.graph import Graph
-from calstudy.products.unbiased import UNBIASED, unbiased
+from calstudy.products.unbiased import UNBIASED, unbiased, why_not
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, Rules
 
@@ -48,7 +47,7 @@ class Recovered:
         result.
     measured_error, by_flat_error, unbiased_error
         Their standard errors, (Nk,): by the scatter over realizations of the difference from the power of the signal of
-        the same realization, so that they are free of its sample variance.
+        the same realization, so that they are free of its sample variance; of a single realization, its own errors.
     within
         Fraction of the bins and realizations in which W^-1 P^R is within 1 and 1.96 of its errors of the mean power of
         the signals, (2,)
@@ -78,9 +77,13 @@ def recovered(found: Sequence[UnbiasedSpectrum]) -> Recovered:
     known = np.isfinite(pulls)
     means = {name: values.mean(axis=0) for name, values in routes.items()}
     own = np.array([one.signal / truth for one in found])
-    errors = {
-        f"{name}_error": (values - own).std(axis=0, ddof=1) / np.sqrt(len(found)) for name, values in routes.items()
-    }
+    if len(found) == 1:
+        [one] = found
+        each = one.measured_error, one.measured_error / one.flat_transfer, one.error
+        errors = {f"{name}_error": error / truth for name, error in zip(routes, each, strict=True)}
+    else:
+        scatter = {name: (values - own).std(axis=0, ddof=1) for name, values in routes.items()}
+        errors = {f"{name}_error": values / np.sqrt(len(found)) for name, values in scatter.items()}
     for values in (*means.values(), *errors.values()):
         values[~known.all(axis=0)] = np.nan
     within = np.array([np.mean(np.abs(pulls[known]) < limit) for limit in WITHIN])
@@ -174,7 +177,7 @@ class UnbiasedFigure(StudyFigure):
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
         if reason := super().refusal(experiment):
             return reason
-        lacking = why_no_response(experiment)
+        lacking = why_not(experiment)
         return None if lacking is None else f"needs {lacking}"
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:

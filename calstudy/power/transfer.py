@@ -118,7 +118,7 @@ BANDS = (0.1, 0.2, 0.3, 0.5, 1.0)
 
 
 # The key `array` in the metadata of a field is its name among the arrays of a figure, where published figures have
-# another one than the field (see `calstudy.figures.save.figure_arrays`).
+# another one than the field (see `calstudy.plotting.style.figure_arrays`).
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ none elsewhere. Rows of W are the window functions. Their sum is T of a flat spe
 spectrum only. W^-1 P^R is right for every spectrum that is flat within each bin.
 
 Signals are random, white within a bin, independent from one delay to the next, and the same on redundant baselines.
-Power at k above the last bin counts in the last. Bins without modes outside the wedge, or of whose own power less than
-`LEAST` is left, have no result: what is measured there is the power of their neighbours. They count as having the power
-of the nearest bin that has a result.
+Power at k above the last bin counts in the last, and below the first in the first. Bins without modes outside the
+wedge, or of whose own power less than `LEAST` is left, have no result: what is measured there is the power of their
+neighbours. They count as having the power of the nearest bin that has a result.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class BinSignals:
         k = np.hypot(k_perpendicular(astropy, lengths, centre)[:, None], k_parallel(astropy, delay, centre))
         limits = np.asarray(edges, float)
         self._n_bins = limits.size - 1
-        self._bins = np.minimum(np.searchsorted(limits, k, side="left") - 1, self._n_bins - 1)
+        self._bins = np.clip(np.searchsorted(limits, k, side="left") - 1, 0, self._n_bins - 1)
 
     def draw(self, rng: np.random.Generator) -> Iterator[np.ndarray]:
         """Yield a signal for each bin, complex, (Nbls, Nfreqs): parts of one with a mean square of one per channel."""

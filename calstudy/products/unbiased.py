@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
+from calstudy.experiment.model import Experiment
 from calstudy.power.settings import PowerSettings
 from calstudy.products import corruption, signal_loss
 from calstudy.products.expected_loss import (
@@ -16,6 +17,7 @@ from calstudy.products.expected_loss import (
     cost_of_responses,
     modes_of,
     solved_inputs,
+    why_no_response,
 )
 from calstudy.products.files import read_json, spectrum_file
 from calstudy.products.graph import Graph, memoize, required
@@ -37,9 +39,17 @@ REDUNDANT = 1.0
 """Baselines whose vectors agree to this, m, see the same signal."""
 
 
+def why_not(experiment: Experiment) -> str | None:
+    """Return what an experiment lacks for a spectrum without its loss, to follow "needs", or None."""
+    pairs = None if experiment.power.pairs == "same-baseline" else "power.pairs: same-baseline"
+    return why_no_response(experiment) or pairs
+
+
 @memoize
 def unbiased(graph: Graph) -> Task:
-    """Return the task of the spectrum without its loss, of an experiment for which `why_no_response` is None."""
+    """Return the task of the spectrum without its loss; raises InputError if an experiment cannot have one."""
+    if lacking := why_not(graph.experiment):
+        raise InputError(f"figure 'unbiased': needs {lacking}")
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
     even, odd = (
         BinResponse(f"response to each bin of k, {parity}", power=power, temporary=True, **solved_inputs(graph, parity))
@@ -70,7 +80,8 @@ class BinResponse(Solved, stage="bin-response", version=1):
             fit = solution.problem, solution.gains, solution.model
             drawn = [list(signals.draw(rng)) for _ in range(DRAWS)]
             left = [[modes.amplitudes(response_to(*fit, signal)) for signal in parts] for parts in drawn]
-            powers = [np.abs(modes.amplitudes(signal)) ** 2 for parts in drawn for signal in parts]
+            used = solution.problem.weights > 0
+            powers = [np.abs(modes.amplitudes(used * signal)) ** 2 for parts in drawn for signal in parts]
             arrays = {
                 "left": np.array(left, np.complex64),
                 "put_in": np.sum(powers, axis=0) / DRAWS,
@@ -86,7 +97,11 @@ class BinResponse(Solved, stage="bin-response", version=1):
 
 
 class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
-    """The spectrum of the residual without its loss, by the window functions of one integration."""
+    """The spectrum of the residual without its loss, by the window functions of one integration.
+
+    They are those of a run that is so short that the loss of one integration is that of the average. Errors are those
+    of the whole EoR and noise, upper bounds for what is left of them, in bins that are taken as independent.
+    """
 
     power: PowerSettings
     even: Input
@@ -117,8 +132,8 @@ class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
             for name in ("residual", "eor")
         )
         known = read_json(self.scale / SCALE)["flux_scale"]
-        squared, bins = 1 if known is None else known**2, slice(edges.size - 1)
-        measured, error = squared * residual.power.real[bins], squared * residual.error[bins]
+        bins = slice(edges.size - 1)
+        measured, error = (1 if known is None else known**2) * residual.power.real[bins], residual.error[bins]
         power, its_error = deconvolved(window, measured, error)
         k = (edges[1:] + edges[:-1]) / 2
         found = UnbiasedSpectrum(k, edges, window, measured, error, power, its_error, signal.power.real[bins])

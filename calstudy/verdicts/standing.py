@@ -3,7 +3,7 @@
 In a band of k, a calibrator
 
 - *passes* in a world if its bias is below the limit by two standard deviations, |bias| + 2 sigma < limit, and T is
-  measured (`calstudy.verdicts.standing`),
+  measured,
 - *fails* if it is above by two standard deviations, if T is not that of a solution (below -0.1 or above 1.2 by more
   than two standard deviations), or if the calibrator cannot work there,
 - is *open* otherwise: the errors of this run are too large to tell. Without a bias, the measured one is about sigma,
@@ -11,6 +11,11 @@ In a band of k, a calibrator
 
 It passes the comparison if it passes in all worlds, and fails if it fails in one. The bias and its error are those of
 the scores, in units of the EoR.
+
+T is measured where it can be the part of the EoR's power that is left. A T below -0.1 or above 1.2 does not belong to a
+calibration that found a solution: noise, interference or a fit that diverged makes such values. With an error above 0.3
+the 95 % interval contains most values from 0 to 1. An error is NaN where a bin has a single sample; T is then judged by
+its value.
 """
 
 from __future__ import annotations

@@ -244,6 +244,7 @@ def test_flags_reach_gains_residuals_averages_and_data_without_effects(run):
     assert not np.delete(np.delete(gains.flags, DEAD, axis=1), GAPS, axis=2).any()
 
 
+@pytest.mark.chain
 def test_what_is_under_flags_changes_nothing(run):
     """1e6 Jy in flagged channels: the solves end, and residual and spectra are of the order of the noise."""
     _, made = run
@@ -259,6 +260,7 @@ def test_what_is_under_flags_changes_nothing(run):
     assert found["measurements"]["product_over_data"]["value"] < 1e-3
 
 
+@pytest.mark.chain
 def test_all_variants_have_the_same_baselines_so_that_spectra_compare(run):
     _, made = run
     residual, eor = (spectra.read_delay_spectra(made[name]) for name in ("power", "power of eor"))
