@@ -12,7 +12,7 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.observation import Observation
 from calstudy.base.resources import Usage
 from calstudy.calibrate.degeneracy import sky_model_slope
-from calstudy.calibrate.deviation import PASSES, Estimate, estimate
+from calstudy.calibrate.deviation import LEAST, PASSES, Estimate, estimate
 from calstudy.calibrate.interface import Assumed, Calibration, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, repeat_structure, weight_change
@@ -28,8 +28,10 @@ from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import Solution, Solver, WarmStart, solve_warm
 
-SEARCH_TOLERANCE = 1e-3
-"""Of solves from which a deviation is estimated that is not the last."""
+SEARCH_TOLERANCE, NEAR = 1e-3, 0.1
+"""Tolerance of the solves far from the most likely deviations, and the relative change of these that ends the search.
+
+Solves to this tolerance move on slowly, and deviations with them, so that these do not settle."""
 NO_EXACT_SOLVE = "only solves with the tolerance of the search for the deviation gave gains"
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 UNRESOLVED_DEVIATION = (
@@ -154,7 +156,8 @@ class _Passes:
     """Solves with weights from the gains, and deviations of the foregrounds, of the pass before, until both settle.
 
     Settings ask for one of the two, or both. `seed` is that of the estimates. A deviation has errors of some percent,
-    and needs no better solution than `SEARCH_TOLERANCE`: only the last pass has the tolerance of the solver.
+    and is searched for with solves to `SEARCH_TOLERANCE`, until it changes by less than `NEAR`; the passes after that
+    have the tolerance of the solver.
     """
 
     def __init__(self, settings: GainFit, solver: Solver, seed: tuple[int, int]) -> None:
@@ -178,27 +181,27 @@ class _Passes:
         current = self._for_pass(problem, gains, deviations)
         done: list[_Pass] = []
         found: Estimate | None = None
-        change, anew, settled, exact = 0.0, True, False, self._search is self._solver
-        exact_before = exact
+        change, anew, exact, searched = 0.0, True, self._search is self._solver, False
         while len(done) < self._most:
-            exact = exact or settled or len(done) == self._most - 1
+            exact = exact or len(done) == self._most - 1
             solution, warm, anew = _solve(current, self._solver if exact else self._search, warm, anew)
             if done and not solution.record.usable:
-                # The gains of a rough solve are not those of the settings.
-                return self._kept(done, change, found, "" if exact_before else NO_EXACT_SOLVE)
-            exact_before = exact
+                return self._kept(done, change, found, NO_EXACT_SOLVE if searched else "")
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
             if not solution.record.usable:
                 break
             # Weights that settle further hardly change an estimate that has settled.
-            if self._estimated and (found is None or not found.settled):
+            if self._estimated and (found is None or searched or not found.settled):
                 found = estimate(current, solution.gains, solution.model, self._seed)
+            searched = not exact
+            if found is not None and not exact:
+                exact = found.settled or np.allclose(found.deviations, current.fractions, rtol=NEAR, atol=LEAST)
             before, current = current, self._for_pass(problem, solution.gains, found and found.deviations)
             change = 0.0 if self._weights is None else weight_change(current.weights, before.weights)
             settled = (self._weights is None or change < self._weights.tolerance) and (found is None or found.settled)
             # What follows from gains that are far from the solution leads away from it.
             far = solution.record.status == "max-steps" or not (found is None or found.resolved)
-            if far or (settled and exact):
+            if far or (settled and not searched):
                 break
         return self._kept(done, change, found)
 
