@@ -95,6 +95,7 @@ NOT_TRIED = {
     "cannot be drawn": "figures of other studies",
     "asks for 'beam-fit'": "the beam of the base is a formula",
     "asks for 'delay-floor'": "the bandwidth of the base is too small",
+    "asks for 'unbiased'": "the baselines of the base are crossed with others of their group, if there are some",
     "weights that stay as they are": "in the other experiment",
     "must be null where foregrounds are fitted": "tried with other calibrators",
 }
