@@ -105,7 +105,7 @@ def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
         left.errorbar(found.k + (2 * place - 1) * shift, power, yerr=SIGMAS_95 * error, **bars)
     left.plot([], [], color=style.BAND, linewidth=3, label="$P^S$")
     left.set(xlabel=style.WAVENUMBER, ylabel=rf"$P$ ({style.POWER_UNIT})", yscale="log", xlim=(0, found.bin_edges[-1]))
-    left.legend()
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=3)
     known = np.isfinite(found.power)
     for window, total in zip(found.window[known], found.flat_transfer[known], strict=True):
         right.plot(found.k, window / total, linewidth=0.8)

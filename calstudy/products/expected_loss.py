@@ -41,7 +41,7 @@ from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
-    from calstudy.calibrate.expected_loss import ExpectedTransfer
+    from calstudy.calibrate.expected_loss import DelayModes, ExpectedTransfer
     from calstudy.calibrate.problem import CalibrationProblem
 
 RESPONSE, AMPLITUDES = "linear-response.json", "amplitudes.npz"
@@ -127,6 +127,10 @@ class _Solution:
         import numpy as np
 
         return np.linalg.norm(self.vectors, axis=1)
+
+    def axes(self, modes: DelayModes) -> dict[str, Any]:
+        """Return what `modes_of` needs beside amplitudes: delays, lengths and the centre of the band."""
+        return {"delay": modes.delay, "lengths": self.lengths, "centre": self.frequency.mean()}
 
 
 class Solved(Calibrated):
@@ -215,11 +219,9 @@ class Response(Solved, stage="response", version=1):
             left = response_to(solution.problem, solution.gains, solution.model, signal)
             modes = DelayModes(solution.frequency, self.power.taper)
             arrays = {
+                **solution.axes(modes),
                 "signal": modes.amplitudes(signal),
                 "left": modes.amplitudes(left),
-                "delay": modes.delay,
-                "lengths": solution.lengths,
-                "centre": solution.frequency.mean(),
             }
         np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
         return {}

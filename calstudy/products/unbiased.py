@@ -83,11 +83,9 @@ class BinResponse(Solved, stage="bin-response", version=1):
             used = solution.problem.weights > 0
             powers = [np.abs(modes.amplitudes(used * signal)) ** 2 for parts in drawn for signal in parts]
             arrays = {
+                **solution.axes(modes),
                 "left": np.array(left, np.complex64),
                 "put_in": np.sum(powers, axis=0) / DRAWS,
-                "delay": modes.delay,
-                "lengths": solution.lengths,
-                "centre": solution.frequency.mean(),
             }
         np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
         return {}

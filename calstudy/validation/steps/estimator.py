@@ -52,7 +52,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.units import Wavenumber
 from calstudy.claims.bins import clustered_mean, pooled
 from calstudy.corrupt.levels import Levels
-from calstudy.experiment.model import Variant
+from calstudy.experiment.model import Component, Variant
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.cosmology import make_cosmology, radial_scale, redshift, transverse_scale
@@ -65,6 +65,12 @@ from calstudy.products.graph import Graph
 from calstudy.run.task import Task
 from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Case, Findings, Limit, Step, StepInput, only
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
+
+
+def _alone(graph: Graph, component: Component) -> Mapping[str, Task]:
+    """Return the spectra of one component without the others, by its name, and the levels of all."""
+    variant = Variant(components=(component,))
+    return {component: spectra.variant_power(graph, component, variant), "levels": corruption.levels(graph)}
 
 
 class Noise(Step):
@@ -87,8 +93,7 @@ class Noise(Step):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the spectra of the noise alone, and its level."""
-        noise = Variant(components=("noise",))
-        return {"noise": spectra.variant_power(graph, "noise", noise), "levels": corruption.levels(graph)}
+        return _alone(graph, "noise")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the spectra of the noise with P_N."""
@@ -184,8 +189,7 @@ class FlatSignal(Step):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the spectra of the EoR alone, and its level."""
-        eor = Variant(components=("eor",))
-        return {"eor": spectra.variant_power(graph, "eor", eor), "levels": corruption.levels(graph)}
+        return _alone(graph, "eor")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the modes of all experiments with the input."""
@@ -291,8 +295,7 @@ class SteepSignal(Step):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the spectra of the EoR alone, and its level."""
-        eor = Variant(components=("eor",))
-        return {"eor": spectra.variant_power(graph, "eor", eor), "levels": corruption.levels(graph)}
+        return _alone(graph, "eor")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Compare the modes of all experiments with the windowed input."""
