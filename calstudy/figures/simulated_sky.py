@@ -223,7 +223,7 @@ def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment)
     return SimulatedComponents(
         wedge=cylindrical_average(of_foregrounds, settings),
         eor=with_errors(spectrum, signal=spectrum),
-        expected=input_power(experiment.sky.eor, spectrum.k, settings.cosmology),
+        expected=input_power(experiment.sky.eor, spectrum.k, settings.cosmology, experiment.instrument.channels.band),
         baselines=_baselines(foregrounds, eor, levels.eor_factor, settings.taper),
         buffer=settings.wedge_buffer,
     )

@@ -100,12 +100,13 @@ def _effective_densities(cosmology: FLRW, z: float) -> tuple[float, float]:
 MILLIKELVIN2 = 1e6
 
 
-def input_power(settings: Eor, k: np.ndarray, cosmology: str) -> np.ndarray:
+def input_power(settings: Eor, k: np.ndarray, cosmology: str, band: tuple[float, float] | None = None) -> np.ndarray:
     """Return the input P(k), mK^2 h^-3 Mpc^3, at wavenumbers `k` (h/Mpc, any shape).
 
-    Amplitude and shape in the settings of the EoR sky are in units without h.
+    Amplitude and shape in the settings of the EoR sky are in units without h. `band` has the centres of the first and
+    the last channel of the data, Hz; only a box needs it.
     """
     from calstudy.sky.eor import input_power as in_kelvin
 
     h = float(make_cosmology(cosmology).h)
-    return MILLIKELVIN2 * h**3 * in_kelvin(settings, np.asarray(k) * h, h)
+    return MILLIKELVIN2 * h**3 * in_kelvin(settings, np.asarray(k) * h, h, band)

@@ -150,6 +150,7 @@ def _reduced(graph: Graph) -> Task:
         "spectra of a realization",
         power=experiment.power,
         eor_settings=experiment.sky.eor,
+        band=experiment.instrument.channels.band if experiment.sky.eor.spectrum == "box" else None,
         residual=residual,
         residual_without_eor=without,
         eor=eor,
@@ -163,6 +164,7 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
 
     power: PowerSettings
     eor_settings: Eor = called("eor")
+    band: tuple[float, float] | None = None
     residual: Input
     residual_without_eor: Input
     eor: Input
@@ -188,7 +190,7 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
             for name, mean in means.items():
                 save_spectrum(output / spectrum_file(name, region), with_errors(mean, **errors[name]))
         edges = make_bin_edges(power.bins)
-        put_in = input_power(self.eor_settings, (edges[1:] + edges[:-1]) / 2, power.cosmology)
+        put_in = input_power(self.eor_settings, (edges[1:] + edges[:-1]) / 2, power.cosmology, self.band)
         factor = read_json(self.levels / LEVELS)["eor_factor"]
         write_json(output / INPUT, {"power_mk2_h3_mpc3": (factor**2 * put_in).tolist()})
         return {}

@@ -164,6 +164,11 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
         followed = 36 * chebyshev_count(_rotation(instrument) / 2, 1e-15) + 100
         memory = engine.memory + kept + followed * sources + (30 * sources * channels if eor else 0) + 4 * disk
         seconds = 3 + engine.seconds
+        if isinstance(sky, Eor) and sky.spectrum == "box" and sky.path is not None:
+            from calstudy.sky.boxes import MEMORY_PER_CELL, SECONDS_PER_CELL, read_box
+
+            cells = read_box(sky.path).n_cells(instrument.channels.band)
+            memory, seconds = memory + MEMORY_PER_CELL * cells, seconds + SECONDS_PER_CELL * cells
         if beams > 1:
             seconds += beams * TABLE_SECONDS * size.polarizations * channels
             memory += beams * (TABLE_MEMORY * size.polarizations * channels + 2e7)

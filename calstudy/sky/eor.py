@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
+from calstudy.sky.boxes import box_power
 from calstudy.sky.settings import Eor
 
 # Nodes of the radial wavenumber integral: per logarithmic interval near zero, per channel beyond.
@@ -28,8 +29,8 @@ class EorField:
     """A Gaussian random sky of known P(k), computed for any subset of the channels.
 
     The flat spectrum is one independent normal number per pixel and channel with variance σ²(ν) = P / V(ν), where V is
-    the comoving volume of the voxel (paper §Simulations; Mpc without h). A power law, or a table, is correlated between
-    channels; see `channel_covariance`.
+    the comoving volume of the voxel (paper §Simulations; Mpc without h). A power law, a table or a box is correlated
+    between channels; see `channel_covariance`.
 
     The field is not smoothed over the channel (P is white up to the Nyquist wavenumber of the channel spacing) nor over
     the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power law). A delay spectrum
@@ -150,23 +151,34 @@ class EorField:
         """Return F, (Nfreqs, 2 Nnodes), with C_ℓ = F Fᵀ: a cosine and a sine wave per quadrature node."""
         phase, weight = _phase_quadrature(len(self.frequencies))
         wavenumber = np.hypot(phase / self.depth[:, None], (ell + 0.5) / self.distance[:, None])
-        power = input_power(self.settings, wavenumber, self._hubble)
+        band = float(self.frequencies[0]), float(self.frequencies[-1])
+        power = input_power(self.settings, wavenumber, self._hubble, band)
         amplitude = np.sqrt(power * weight) / (self.distance * np.sqrt(self.depth))[:, None]
         turns = np.arange(len(self.frequencies))[:, None] * phase
         return np.concatenate([amplitude * np.cos(turns), amplitude * np.sin(turns)], axis=1)
 
 
-def input_power(settings: Eor, k: np.ndarray, hubble: float) -> np.ndarray:
+def input_power(settings: Eor, k: np.ndarray, hubble: float, band: tuple[float, float] | None = None) -> np.ndarray:
     """Return the P(k) that is put in, in K² Mpc³ without h, at wavenumbers `k` in 1/Mpc, of any shape.
 
-    `hubble` is h, in which the units of tables are. Raises InputError if a table cannot be used.
+    `hubble` is h, in which the units of tables are. `band` has the centres of the first and the last channel in Hz,
+    which choose the part of a lightcone; only a box needs it. Raises InputError if a table or a box cannot be used.
     """
     k = np.asarray(k, dtype=float)
     if settings.path is not None:
-        known, power = read_power_table(settings.path)
+        path, boxed = settings.path, settings.spectrum == "box"
+        known, power = _box_table(path, hubble, band) if boxed else read_power_table(path)
         return 1e-6 / hubble**3 * np.exp(np.interp(np.log(k / hubble), np.log(known), np.log(power)))
     index = settings.index if settings.spectrum == "power-law" else 0.0
     return settings.amplitude * (k / settings.pivot_k) ** index
+
+
+def _box_table(path: Path, hubble: float, band: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return k and P(k) of a box as a table has them."""
+    if band is None:
+        raise ValueError("band: is needed for the power spectrum of a box")
+    k, power = box_power(path, band)
+    return k / hubble, power * hubble**3
 
 
 def read_power_table(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -226,7 +226,7 @@ Diffuse = Annotated[HaslamMap | SyntheticDiffuse | NoDiffuse, choice("kind")]
 class Eor(Section):
     """Gaussian random 21 cm brightness with a known power spectrum, as one HEALPix map per channel."""
 
-    spectrum: Literal["flat", "power-law", "table"] = "flat"
+    spectrum: Literal["flat", "power-law", "table", "box"] = "flat"
     amplitude: PowerDensity = Field(
         12482.356, gt=0, description="P(k), or P at `pivot_k` for a power law (paper §Simulations)."
     )
@@ -236,7 +236,8 @@ class Eor(Section):
         None,
         strict=False,
         description="For spectrum: table, a text file with k in h/Mpc and P(k) in mK^2 h^-3 Mpc^3 in two columns, for "
-        "the redshift of the data. P is a power law between two k, and constant beyond the first and the last.",
+        "the redshift of the data. For spectrum: box, a coeval box or a lightcone saved by 21cmFAST 3 or 4, whose P(k) "
+        "is used as such a table. P is a power law between two k, and constant beyond the first and the last.",
     )
     nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
     seed: int = Field(2, ge=0, description="Seed of the maps.")
@@ -245,8 +246,8 @@ class Eor(Section):
     def _fields_are_used(self) -> Eor:
         if self.index and self.spectrum != "power-law":
             raise fault("index", f"{self.index:g} has no effect with spectrum: {self.spectrum}; use power-law")
-        if (self.path is None) == (self.spectrum == "table"):
-            raise fault("path", "is needed with spectrum: table, and has no effect with others")
+        if (self.path is None) == (self.spectrum in ("table", "box")):
+            raise fault("path", "is needed with spectrum: table or box, and has no effect with others")
         return self
 
 

@@ -19,21 +19,34 @@ from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
 from calstudy.sky.counts import expected_sources
-from calstudy.sky.settings import Foregrounds, SyntheticSources
+from calstudy.sky.settings import Eor, Foregrounds, SyntheticSources
 
 LONG_AVERAGE = 15.0
 """Minutes; the sky moves by a sixth of the beam of an MWA tile."""
+SNAPSHOTS = 0.02
+"""Of 1 + z: how far coeval boxes of 21cmFAST are apart by default."""
 
 
 def require_possible(experiment: Experiment) -> None:
     """Raise InputError if a beam or the EoR cannot be made, or an effect or the calibrator refuses the data."""
     require_beams(experiment.instrument)
-    if experiment.sky.eor.path is not None:
-        from calstudy.sky.eor import read_power_table
-
-        read_power_table(experiment.sky.eor.path)
+    _require_eor(experiment.sky.eor, experiment.instrument.channels.band)
     require_usable(experiment.corruption.effects, size_of_instrument(experiment.instrument))
     require_calibration(experiment)
+
+
+def _require_eor(eor: Eor, band: tuple[float, float]) -> None:
+    """Raise InputError if a table or a box cannot be used for a band."""
+    if eor.path is None:
+        return
+    if eor.spectrum == "box":
+        from calstudy.sky.boxes import read_box
+
+        read_box(eor.path).part(band)
+    else:
+        from calstudy.sky.eor import read_power_table
+
+        read_power_table(eor.path)
 
 
 def require_beams(instrument: InstrumentSettings) -> None:
@@ -45,7 +58,8 @@ def require_beams(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    return tuple(note for note in (_needless_limit(experiment), _long_average(experiment)) if note)
+    found = (_needless_limit(experiment), _long_average(experiment), _distant_box(experiment))
+    return tuple(note for note in found if note)
 
 
 def _needless_limit(experiment: Experiment) -> str:
@@ -70,6 +84,22 @@ def _long_average(experiment: Experiment) -> str:
     return (
         f"power.coherent_time = null: all {minutes:.0f} min are averaged coherently. A sky that drifts through the "
         "beam loses power in it, the EoR as well; such as '10 min' averages the powers of blocks"
+    )
+
+
+def _distant_box(experiment: Experiment) -> str:
+    eor = experiment.sky.eor
+    if eor.spectrum != "box" or eor.path is None:
+        return ""
+    from calstudy.sky.boxes import read_box, redshifts_of
+
+    redshift = read_box(eor.path).redshift
+    low, high = redshifts_of(experiment.instrument.channels.band)
+    if redshift is None or low - SNAPSHOTS * (1 + low) <= redshift <= high + SNAPSHOTS * (1 + high):
+        return ""
+    return (
+        f"sky.eor.path = {str(eor.path)!r}: a box of redshift {redshift:.2f} for a band of {low:.2f} to {high:.2f}; "
+        "its power is used as it is, though it changes with redshift"
     )
 
 
