@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
+from calstudy.base.errors import InputError
 from calstudy.base.files import digest_json
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
@@ -171,6 +172,11 @@ class Study(ABC):
     @abstractmethod
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study cut to a budget, and the number of workers; raises InputError if it does not fit."""
+
+    def with_finished(self, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Self:
+        """Return the study with parts taken from finished runs, which a kind without them refuses."""
+        del folders, console, planned
+        raise InputError("--finished: only a collection (a file with the key 'experiments') takes members from runs")
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
