@@ -25,10 +25,9 @@ from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
 from calstudy.results.reader import SHOWN
 from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule, without_record
-from calstudy.run.leases import Lease
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
-from calstudy.run.store import Product, Store
+from calstudy.run.store import Lease, Product, Store
 from calstudy.run.task import Task, unique
 from calstudy.studies.folder import (
     EXPERIMENT,
