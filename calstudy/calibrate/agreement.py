@@ -5,7 +5,7 @@ Every number has its scatter over the antennas, baselines or integrations on whi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -281,6 +281,9 @@ EXPECTED = np.arange(1, 100) / 100
 """Fractions of a normal distribution within limits around zero, with which those of the deviations are compared."""
 LIMITS = (1.0, SIGMAS_95)
 """Limits in units of the error, within which there are 68.3 and 95 %."""
+ALLOWED = ((0.6827, 0.03), (0.95, 0.02))
+"""Fractions within these limits, and how far observed ones may be from them."""
+PARTS = ("amplitude", "phase")
 
 
 def pulls(errors: GainErrors, gains: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -327,3 +330,44 @@ def _fractions(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """Return the fractions of the known values whose size is below each limit; NaN if none is known."""
     known = np.sort(np.abs(values[np.isfinite(values)]))
     return np.searchsorted(known, limits) / known.size if known.size else np.full(limits.shape, np.nan)
+
+
+@dataclass(frozen=True)
+class Covered:
+    """Fractions of the deviations from the true gains, pooled over all realizations of the noise.
+
+    Attributes
+    ----------
+    expected : fractions of a normal distribution, (Nexpected,)
+    observed, error : of amplitudes and of phases: mean over realizations, and its standard error, (2, Nexpected)
+    within, within_error : the same within 1 and 1.96 errors, (2, 2)
+    worst : of the antenna that is farthest from what is expected, (2, 2)
+    realizations : number of realizations
+    """
+
+    expected: np.ndarray
+    observed: np.ndarray
+    error: np.ndarray
+    within: np.ndarray
+    within_error: np.ndarray
+    worst: np.ndarray
+    realizations: int
+
+
+def pooled(parts: Sequence[GainCoverage]) -> Covered:
+    """Pool solves with independent noise."""
+    observed, within = (np.concatenate([getattr(part, name) for part in parts]) for name in ("observed", "within"))
+    within = within[:, :, np.isfinite(within).any(axis=(0, 1, 3))]
+    antennas = np.nanmean(within, axis=0)
+    means, root = np.nanmean(within, axis=2), np.sqrt(len(within))
+    right = np.array([fraction for fraction, _ in ALLOWED])
+    worst = np.nanargmax(np.abs(antennas - right), axis=1)
+    return Covered(
+        EXPECTED,
+        observed.mean(axis=0),
+        observed.std(axis=0, ddof=1) / root,
+        means.mean(axis=0),
+        means.std(axis=0, ddof=1) / root,
+        np.take_along_axis(antennas, worst[:, None], axis=1)[:, 0],
+        len(within),
+    )

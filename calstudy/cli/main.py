@@ -111,9 +111,7 @@ def run(
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
     study = load_study(file, scale, changes)
     if finished:
-        from calstudy.studies.kinds.collection import with_finished
-
-        study = with_finished(study, finished, console)
+        study = study.with_finished(finished, console)
     show_run(run_study(study, Budget(workers, max_memory, scheduler), console, strict), console)
 
 
@@ -135,10 +133,8 @@ def plan(
 
     study = load_study(file, scale, overrides or ())
     if finished:
-        from calstudy.studies.kinds.collection import with_finished
-
         # With JSON, nothing else is on standard output.
-        study = with_finished(study, finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
+        study = study.with_finished(finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
     found = describe_plan(study, Budget(workers, max_memory), strict)
     if as_json:
         typer.echo(json.dumps(found, indent=1))
@@ -191,8 +187,7 @@ def report(
     With several runs, write a page with all: power spectra and T in one chart each, and side by side fields that
     differ, verdicts, figures and tables.
     """
-    from calstudy.report.page import write_report
-    from calstudy.report.several import write_several
+    from calstudy.report.page import write_report, write_several
 
     if not others:
         if output is not None or overwrite:

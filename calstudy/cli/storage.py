@@ -96,9 +96,9 @@ def store(
 
 
 def _delete(chosen: list[Product], store: Store, console: Console) -> None:
-    from calstudy.run.leases import LOCK, needed_by_runs
+    from calstudy.run.store import LEASE_LOCK, needed_by_runs
 
-    with store.lock(*LOCK):
+    with store.lock(*LEASE_LOCK):
         needed = needed_by_runs(store)
         for product in chosen:
             stage, key = str(product.record["stage"]), str(product.record["key"])

@@ -20,6 +20,7 @@ from calstudy.base.plugins import Plugin, guarded
 from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import FIGURES, Experiment
 from calstudy.plotting.style import figure_arrays, journal_style, note_stand_ins, save_figure
+from calstudy.products import calibration, corruption
 from calstudy.products.comparison import Case, read_cases
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
@@ -166,6 +167,25 @@ class StudyFigure(Plugin):
             ``notes``: the stand-ins, which are printed below the figure. Of a family, ``layouts`` has the array
             layout of each member, by label, and ``members`` the settings of each if there are any.
         """
+
+
+class InspectedFigure(StudyFigure):
+    """A figure of two antennas in one integration, those of `outputs.inspect`: of their gains, or of their baseline."""
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the true gains and the calibration of `residual`."""
+        experiment = graph.experiment
+        fitted = calibration.calibration(graph, experiment.variants["residual"], experiment.outputs.inspect.realization)
+        return {"gains": corruption.gains(graph), "calibration": fitted}
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return the layout, the antennas and the integration."""
+        inspect = graph.experiment.outputs.inspect
+        return {
+            "layout": graph.experiment.instrument.layout,
+            "antennas": list(inspect.antennas),
+            "integration": inspect.integration,
+        }
 
 
 def _error_of_transfer(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
-from calstudy.calibrate.agreement import EXPECTED, GainCoverage
+from calstudy.calibrate.agreement import ALLOWED, PARTS, Covered, pooled
 from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.plotting import style
 from calstudy.products.corruption import PARITIES
@@ -27,52 +26,10 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
 
 CSV = "gain-coverage.csv"
-PARTS = {"amplitude": style.BLUE, "phase": style.ORANGE}
-ALLOWED = ((0.6827, 0.03), (0.95, 0.02))
-"""Fractions within 1 and 1.96 errors, and how far observed ones may be from them."""
+COLOURS = (style.BLUE, style.ORANGE)
+"""Of amplitudes and phases."""
 ACROSS = 3
 """Number of panels in a row."""
-
-
-@dataclass(frozen=True)
-class Covered:
-    """Fractions of the deviations from the true gains, pooled over all realizations of the noise.
-
-    Attributes
-    ----------
-    expected : fractions of a normal distribution, (Nexpected,)
-    observed, error : of amplitudes and of phases: mean over realizations, and its standard error, (2, Nexpected)
-    within, within_error : the same within 1 and 1.96 errors, (2, 2)
-    worst : of the antenna that is farthest from what is expected, (2, 2)
-    realizations : number of realizations
-    """
-
-    expected: np.ndarray
-    observed: np.ndarray
-    error: np.ndarray
-    within: np.ndarray
-    within_error: np.ndarray
-    worst: np.ndarray
-    realizations: int
-
-
-def pooled(parts: Sequence[GainCoverage]) -> Covered:
-    """Pool solves with independent noise."""
-    observed, within = (np.concatenate([getattr(part, name) for part in parts]) for name in ("observed", "within"))
-    within = within[:, :, np.isfinite(within).any(axis=(0, 1, 3))]
-    antennas = np.nanmean(within, axis=0)
-    means, root = np.nanmean(within, axis=2), np.sqrt(len(within))
-    right = np.array([fraction for fraction, _ in ALLOWED])
-    worst = np.nanargmax(np.abs(antennas - right), axis=1)
-    return Covered(
-        EXPECTED,
-        observed.mean(axis=0),
-        observed.std(axis=0, ddof=1) / root,
-        means.mean(axis=0),
-        means.std(axis=0, ddof=1) / root,
-        np.take_along_axis(antennas, worst[:, None], axis=1)[:, 0],
-        len(within),
-    )
 
 
 @style.journal_style()
@@ -106,7 +63,7 @@ def draw_gain_coverage(members: Mapping[str, Covered]) -> Figure:
 def _draw_fractions(axes: Axes, member: Covered) -> None:
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], color=style.GREY, linewidth=0.6, zorder=0)
-    for (name, colour), observed in zip(PARTS.items(), member.observed, strict=True):
+    for name, colour, observed in zip(PARTS, COLOURS, member.observed, strict=True):
         axes.plot(member.expected, observed, color=colour, label=name)
     found = "\n".join(
         f"{name}: {100 * one:.1f}, {100 * two:.1f} %" for name, (one, two) in zip(PARTS, member.within, strict=True)
@@ -121,7 +78,7 @@ def _draw_fractions(axes: Axes, member: Covered) -> None:
 def _draw_difference(axes: Axes, member: Covered) -> None:
     axes.set_visible(True)
     axes.axhline(0, color=style.GREY, linewidth=0.6, zorder=0)
-    for place, (colour, observed) in enumerate(zip(PARTS.values(), member.observed, strict=True)):
+    for place, (colour, observed) in enumerate(zip(COLOURS, member.observed, strict=True)):
         axes.plot(member.expected, 100 * (observed - member.expected), color=colour)
         chance = 100 * SIGMAS_95 * member.error[place]
         label = "chance, 95 %" if place == 0 else None

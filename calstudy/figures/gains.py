@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures import Drawing, InspectedFigure, StudyFigure
 from calstudy.plotting import style
 from calstudy.plotting.axes import TwoDomains, delay_panel, frequency_and_delay, in_two_domains
-from calstudy.products import calibration, corruption
+from calstudy.products import corruption
 from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, departure_from_mean, rms_of
@@ -131,24 +131,7 @@ def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
     figure.legend(handles=handles, loc="outside upper center", ncols=5, columnspacing=1.1)
 
 
-def inspected(graph: Graph) -> dict[str, Any]:
-    """Return which antennas and integration the figures of single gains and baselines show."""
-    inspect = graph.experiment.outputs.inspect
-    return {
-        "layout": graph.experiment.instrument.layout,
-        "antennas": list(inspect.antennas),
-        "integration": inspect.integration,
-    }
-
-
-def inspected_calibration(graph: Graph) -> dict[str, Task]:
-    """Return the true gains and the calibration of `residual` that is looked at."""
-    experiment = graph.experiment
-    fitted = calibration.calibration(graph, experiment.variants["residual"], experiment.outputs.inspect.realization)
-    return {"gains": corruption.gains(graph), "calibration": fitted}
-
-
-class Gains(StudyFigure):
+class Gains(InspectedFigure):
     """True and fitted gains of two antennas in one integration."""
 
     version: ClassVar[int] = 2
@@ -169,14 +152,6 @@ class Gains(StudyFigure):
         (r"(recovered|residual|aligned_residual)\..*", Drawn(rms_of("residual"), "the rms error of the gains")),
         (r"correction\..*", Drawn(departure_from_mean, "the rms of the ratio about its mean")),
     )
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return true gains and calibration."""
-        return inspected_calibration(graph)
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return which antennas and integration are shown."""
-        return inspected(graph)
 
     def draw(self, job: Job) -> Drawing:
         """Draw true and fitted gains of two antennas."""

@@ -14,10 +14,9 @@ from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.figures.spherical import Marking, draw_points
 from calstudy.figures.wedge import draw_panels
 from calstudy.plotting import style
-from calstudy.power.expected import ExpectedBins
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
-from calstudy.power.transfer import TransferFunction, TransferMap
+from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 from calstudy.products.files import EXPECTED, spectrum_file
 from calstudy.products.files import TRANSFER as FILE
 from calstudy.products.graph import MeasuredGraph, required

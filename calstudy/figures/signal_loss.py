@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from calstudy.power.expected import ExpectedBins
-    from calstudy.power.transfer import TransferFunction, TransferMap
+    from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 
 
 TRANSFER = r"$T = P^{R}/P^{S}$"

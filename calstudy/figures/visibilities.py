@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.gains import inspected, inspected_calibration
+from calstudy.figures import Drawing, InspectedFigure, StudyFigure
 from calstudy.plotting import style
 from calstudy.plotting.axes import (
     TAPER,
@@ -22,7 +21,7 @@ from calstudy.plotting.axes import (
     name_baseline,
 )
 from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay
-from calstudy.products import corruption, simulation
+from calstudy.products import calibration, corruption, simulation
 from calstudy.products.files import DATA, MODEL, RESIDUAL, VISIBILITIES
 from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
@@ -108,7 +107,7 @@ def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], floa
     return pair, length, Visibilities(*(used * read_spectra(path, [pair])[0, integration] for path in paths))
 
 
-class Model(StudyFigure):
+class Model(InspectedFigure):
     """True and fitted foregrounds of one baseline in one integration."""
 
     kind: str = "model"
@@ -125,11 +124,7 @@ class Model(StudyFigure):
         """Return gains, calibration, true foregrounds and noise."""
         experiment = graph.experiment
         noise = corruption.data(graph, experiment.variants["noise"], experiment.outputs.inspect.realization)
-        return {**inspected_calibration(graph), "foregrounds": required(simulation.foregrounds(graph)), "noise": noise}
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the shown baseline and integration."""
-        return inspected(graph)
+        return {**super().inputs(graph), "foregrounds": required(simulation.foregrounds(graph)), "noise": noise}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the true foregrounds of a baseline and the fitted ones, on the scale of the true gains."""
@@ -148,7 +143,7 @@ def draw_data(comparison: VisibilityComparison) -> Figure:
     return draw_comparison(comparison, (r"data $V$", r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$"))
 
 
-class Data(StudyFigure):
+class Data(InspectedFigure):
     """Data of one baseline and the fitted gains times model, in one integration."""
 
     kind: str = "data"
@@ -165,11 +160,7 @@ class Data(StudyFigure):
             corruption.data(graph, experiment.variants[name], experiment.outputs.inspect.realization)
             for name in ("residual", "noise")
         )
-        return {**inspected_calibration(graph), "data": data, "noise": noise}
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the shown baseline and integration."""
-        return inspected(graph)
+        return {**super().inputs(graph), "data": data, "noise": noise}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the data of a baseline with fitted gains times model, and with the noise in them."""
@@ -281,7 +272,7 @@ class Baselines(StudyFigure):
             for name, variant in names.items()
             if variant in variants
         }
-        return {"calibration": inspected_calibration(graph)["calibration"], **inputs}
+        return {"calibration": calibration.calibration(graph, variants["residual"], realization), **inputs}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
         """Return the shown baselines."""

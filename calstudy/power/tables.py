@@ -11,11 +11,10 @@ import h5py
 import numpy as np
 
 from calstudy.base.table import Table
-from calstudy.power.expected import ExpectedBins
 from calstudy.power.gain_bias import GainBias
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
-from calstudy.power.transfer import TransferFunction, TransferMap
+from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 from calstudy.power.windows import UnbiasedSpectrum
 
 Spectrum = TypeVar(

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-from calstudy.power.expected import bins_outside
 from calstudy.power.spectra import BaselineModes
+from calstudy.power.transfer import bins_outside
 
 LEAST = 0.1
 """Smallest W_bb with which a bin b has a result."""
@@ -116,7 +116,7 @@ def window_matrix(
     put_in
         Power of the amplitudes of the signals themselves, of all bins together, mean over draws, (Nbls, Ndelays): what
         is left is measured against it, free of the sample variance of the signals.
-    edges, buffer : as in `calstudy.power.expected.bin_response`
+    edges, buffer : as in `calstudy.power.transfer.bin_response`
     """
     n_bins = edges.size - 1
     bins, used = bins_outside(modes, edges, buffer)

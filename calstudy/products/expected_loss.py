@@ -20,11 +20,11 @@ from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-from calstudy.power.expected import ExpectedBins, bin_expected, bin_response
 from calstudy.power.score import BANDS
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import BaselineModes
 from calstudy.power.tables import save_spectrum
+from calstudy.power.transfer import ExpectedBins, bin_expected, bin_response
 from calstudy.products import calibration, corruption
 from calstudy.products.calibration import Calibrated, prepared_fit
 from calstudy.products.files import (

@@ -28,11 +28,10 @@ from calstudy.calibrate.agreement import from_json as statistics_from_json
 from calstudy.experiment.assumed import assumed_changes
 from calstudy.experiment.files import read_mapping, validate
 from calstudy.experiment.model import Experiment
-from calstudy.power.expected import ExpectedBins
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
-from calstudy.power.transfer import TransferFunction, TransferMap
+from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 from calstudy.products.files import (
     AGREEMENT,
     COMPARISON,

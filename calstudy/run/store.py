@@ -4,6 +4,12 @@ A product is a folder ``<store>/<stage>/<key>/`` of files in standard formats pl
 settings and inputs from which it was made, and the SHA-256 of every file and of the record itself. A folder that exists
 is complete, because it is filled under another name and renamed; a folder that does not match its record is damaged,
 and is made again.
+
+Runs share a store, and the last one removes a temporary product. Before a run looks for existing products, it writes
+the keys of all that it needs to ``<store>/.runs/ID.json``, and holds the lock ``ID.lock`` as long as it lives. It takes
+a key out of the file when no task that it has left needs the product. A temporary product is then removed if no other
+live run names it. Runs that were killed hold no lock: their files do not count, and are removed. All of this is done
+under one lock of the store.
 """
 
 from __future__ import annotations
@@ -28,6 +34,7 @@ from filelock import FileLock, Timeout
 
 from calstudy.base.errors import InputError, error_number
 from calstudy.base.files import digest_json, sha256
+from calstudy.run.task import Task
 
 RECORD, DIGEST = "product.json", "digest"
 """The record of a product, and its field with the digest of all others."""
@@ -152,7 +159,7 @@ class Store:
             shutil.rmtree(grave, ignore_errors=True)
 
     def remove(self, stage: str, key: str) -> None:
-        """Remove a product that no run needs (`calstudy.run.leases`), and the file of its lock."""
+        """Remove a product that no run needs (`calstudy.run.store`), and the file of its lock."""
         self.discard(stage, key)
         self._lock_file(stage, key).unlink(missing_ok=True)
 
@@ -287,3 +294,82 @@ def unreferenced(found: Iterable[Product], named: Iterable[str]) -> list[Product
 
 def _inputs(record: Any) -> list[str]:
     return [str(key) for _, key in record.get("inputs", {}).values()]
+
+
+LEASES = ".runs"
+LEASE_LOCK = ("runs", "leases")
+"""The name of the lock of all leases, as that of a product."""
+
+
+class Lease:
+    """The products that a run still needs, by key; without `holding` it needs none."""
+
+    def __init__(self, store: Store) -> None:
+        self._store, self._path = store, store.root / LEASES / f"{uuid4().hex}.json"
+        self._keys: set[str] = set()
+
+    @contextmanager
+    def holding(self, keys: Iterable[str]) -> Iterator[None]:
+        """Name products as needed within the block."""
+        self._keys = set(keys)
+        lock = FileLock(self._path.with_suffix(".lock"), fallback_to_soft=False)
+        with self._store.lock(*LEASE_LOCK):
+            self._path.parent.mkdir(exist_ok=True)
+            lock.acquire(timeout=0)
+            self._write()
+        try:
+            yield
+        finally:
+            self._keys.clear()
+            _remove(self._path)
+            lock.release()
+
+    def drop(self, tasks: Iterable[Task]) -> None:
+        """Give up tasks, and remove those of their products that were made as temporary ones and that nobody needs.
+
+        Products that a run made to be kept stay, and so does everything in a read-only store.
+        """
+        given_up = list(tasks)
+        found = {task.key: self._store.find(task.stage.name, task.key) for task in given_up}
+        temporary = {
+            key: product for key, product in found.items() if product is not None and product.record.get("temporary")
+        }
+        if not temporary and self._keys.isdisjoint(found):
+            return
+        with suppress(OSError), self._store.lock(*LEASE_LOCK):
+            if self._keys:
+                self._keys.difference_update(found)
+                self._write()
+            needed = needed_by_runs(self._store, self._path)
+            for key, product in temporary.items():
+                if key not in needed:
+                    self._store.remove(product.record["stage"], key)
+
+    def _write(self) -> None:
+        new = self._path.with_suffix(".new")
+        new.write_text(json.dumps(sorted(self._keys)), encoding="utf-8")
+        new.replace(self._path)
+
+
+def needed_by_runs(store: Store, but: Path | None = None) -> set[str]:
+    """Return the keys of what live runs need, except those of one file; `store.lock(*LEASE_LOCK)` must be held."""
+    found: set[str] = set()
+    for path in (store.root / LEASES).glob("*.json"):
+        if path == but:
+            continue
+        lock = FileLock(path.with_suffix(".lock"), fallback_to_soft=False)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            # The run may end at this moment.
+            with suppress(FileNotFoundError):
+                found.update(json.loads(path.read_text(encoding="utf-8")))
+            continue
+        _remove(path)
+        lock.release()
+    return found
+
+
+def _remove(path: Path) -> None:
+    for suffix in (".json", ".new", ".lock"):
+        path.with_suffix(suffix).unlink(missing_ok=True)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
+from calstudy.base.errors import InputError
 from calstudy.base.files import digest_json
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
@@ -24,10 +25,9 @@ from calstudy.experiment.model import Experiment, Folders
 from calstudy.report.page import write_report
 from calstudy.results.reader import SHOWN
 from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule, without_record
-from calstudy.run.leases import Lease
 from calstudy.run.progress import report
 from calstudy.run.provenance import of_other_code, other_code
-from calstudy.run.store import Product, Store
+from calstudy.run.store import Lease, Product, Store
 from calstudy.run.task import Task, unique
 from calstudy.studies.folder import (
     EXPERIMENT,
@@ -171,6 +171,11 @@ class Study(ABC):
     @abstractmethod
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study cut to a budget, and the number of workers; raises InputError if it does not fit."""
+
+    def with_finished(self, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Self:
+        """Return the study with parts taken from finished runs, which a kind without them refuses."""
+        del folders, console, planned
+        raise InputError("--finished: only a collection (a file with the key 'experiments') takes members from runs")
 
     @property
     def stand_ins(self) -> tuple[str, ...]:

@@ -12,9 +12,9 @@ import pytest
 from rich.console import Console
 from tiny import tiny
 
-from calstudy.calibrate.agreement import EXPECTED, GainCoverage
+from calstudy.calibrate.agreement import ALLOWED, EXPECTED, GainCoverage, pooled
 from calstudy.experiment.files import override, validate
-from calstudy.figures.gain_coverage import ALLOWED, GainCoverageFigure, draw_gain_coverage, pooled
+from calstudy.figures.gain_coverage import GainCoverageFigure, draw_gain_coverage
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, run_study

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import same_color, to_rgba
 
-from calstudy.figures.spherical import MARKINGS, draw_spherical, draw_spherical_comparison
-from calstudy.power.limits import Limits
+from calstudy.figures.spherical import MARKINGS, Limits, draw_spherical, draw_spherical_comparison
 
 CAPTION = {
     "uncorrupted": ("o", "#000000"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calstudy.power.expected import bin_response
 from calstudy.power.spectra import BaselineModes
+from calstudy.power.transfer import bin_response
 
 
 def test_what_depends_on_the_noise_lowers_neither_the_retained_part_nor_adds_to_it():

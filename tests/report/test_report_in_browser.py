@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from test_report import CLAIM, MANIFEST, PNG
 
-from calstudy.report.page import write_report
-from calstudy.report.several import write_several
+from calstudy.report.page import write_report, write_several
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="there is no Chromium on this machine")

@@ -10,7 +10,7 @@ from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.products.files import TRANSFER, spectrum_file
-from calstudy.report.several import MOST, read_several, write_several
+from calstudy.report.page import MOST, read_several, write_several
 
 K, EDGES = np.array([0.15, 0.35, 0.7]), np.array([0.1, 0.2, 0.5, 0.9])
 

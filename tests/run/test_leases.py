@@ -12,8 +12,7 @@ import pytest
 
 from calstudy.base.resources import Cost
 from calstudy.run.execution import Lifetimes, Workers, execute, schedule
-from calstudy.run.leases import LOCK, Lease, needed_by_runs
-from calstudy.run.store import Store
+from calstudy.run.store import LEASE_LOCK, Lease, Store, needed_by_runs
 from calstudy.run.task import Piece, Task, unique
 
 
@@ -34,7 +33,7 @@ DATA = Number("data", number=1, temporary=True)
 HOLD = """
 import sys, time
 from pathlib import Path
-from calstudy.run.leases import Lease
+from calstudy.run.store import Lease
 from calstudy.run.store import Store
 
 with Lease(Store(Path(sys.argv[1]))).holding([sys.argv[2]]):
@@ -63,7 +62,7 @@ def run(target: Task, store: Store, lease: Lease) -> None:
 
 
 def needed(store: Store) -> set[str]:
-    with store.lock(*LOCK):
+    with store.lock(*LEASE_LOCK):
         return needed_by_runs(store)
 
 
@@ -93,7 +92,7 @@ def test_a_run_alone_removes_what_it_needs_no_more(store):
         assert store.find("number", DATA.key) is None
         # The file of its lock goes with it, and that of what is kept stays.
         locks = {path.name for path in (store.root / ".locks").iterdir()}
-        assert locks == {f"number-{total(10).key}.lock", "-".join(LOCK) + ".lock"}
+        assert locks == {f"number-{total(10).key}.lock", "-".join(LEASE_LOCK) + ".lock"}
 
 
 def test_a_run_that_was_killed_does_not_count(store):

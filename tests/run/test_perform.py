@@ -16,8 +16,7 @@ from calstudy.base.resources import Cost
 from calstudy.base.user_code import UserCodeError
 from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, Workers, WorkOrder, execute, largest_disk, perform, schedule
-from calstudy.run.leases import Lease
-from calstudy.run.store import Store, products
+from calstudy.run.store import Lease, Store, products
 from calstudy.run.task import Inputs, Piece, Task
 
 EXIT_INPUT = 2
@@ -298,7 +297,7 @@ import os, signal, time
 from pathlib import Path
 from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, Workers, execute, schedule
-from calstudy.run.leases import Lease
+from calstudy.run.store import Lease
 from calstudy.run.store import Store
 from calstudy.run.task import Input, Task
 

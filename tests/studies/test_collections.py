@@ -24,7 +24,7 @@ from calstudy.products.spectra import power
 from calstudy.regression import accept
 from calstudy.run.execution import schedule
 from calstudy.run.store import Store
-from calstudy.studies.kinds.collection import Collection, with_finished
+from calstudy.studies.kinds.collection import Collection
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.show import describe_plan
@@ -216,7 +216,7 @@ def elsewhere(folder: Path, place: Path, *overrides: str) -> Collection:
 def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished, folder, tmp_path):
     runs = finished.folder.parent
     text = io.StringIO()
-    taken = with_finished(elsewhere(folder, tmp_path), [runs], Console(file=text, width=300))
+    taken = elsewhere(folder, tmp_path).with_finished([runs], Console(file=text, width=300))
     assert [line[: line.index("/")] for line in text.getvalue().splitlines()] == [
         f"{name}: taken from " for name in ("hexagon", "redundant")
     ]
@@ -236,7 +236,7 @@ def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished
 def test_a_member_can_come_from_a_reference_and_others_are_run(finished, folder, tmp_path):
     reference = tmp_path / "figures" / "hexagon"
     accept(finished.parts["hexagon"].folder, reference)
-    taken = with_finished(elsewhere(folder, tmp_path), [tmp_path / "figures"], Console(file=io.StringIO()))
+    taken = elsewhere(folder, tmp_path).with_finished([tmp_path / "figures"], Console(file=io.StringIO()))
     assert list(taken.parts) == ["redundant"]
     assert taken.finished == {"hexagon": reference}
     stages = {task.stage.name for task in schedule(taken.targets, Store(tmp_path / "store")).todo}
@@ -245,10 +245,10 @@ def test_a_member_can_come_from_a_reference_and_others_are_run(finished, folder,
 
 def test_a_plan_with_finished_members_is_what_the_run_makes_and_leaves_the_store_alone(finished, folder, tmp_path):
     there, runs = elsewhere(folder, tmp_path), [finished.parts["hexagon"].folder]
-    planned = with_finished(there, runs, Console(file=io.StringIO()), planned=True)
+    planned = there.with_finished(runs, Console(file=io.StringIO()), planned=True)
     plan = describe_plan(planned, Budget(1))
     assert not (tmp_path / "store").exists()
-    taken = with_finished(there, runs, Console(file=io.StringIO()))
+    taken = there.with_finished(runs, Console(file=io.StringIO()))
     counts = Counter(task.stage.name for task in schedule(taken.targets, Store(tmp_path / "store")).todo)
     assert {row["stage"]: row["to_make"] for row in plan["stages"] if row["to_make"]} == counts
     # Without the option the other member is counted as well.
@@ -268,7 +268,7 @@ def test_the_plan_in_json_is_alone_on_standard_output(finished, folder, tmp_path
 def test_a_finished_run_of_something_else_is_not_taken(finished, folder, tmp_path):
     text, other = io.StringIO(), elsewhere(folder, tmp_path, "power.taper=hann")
     with pytest.raises(InputError, match=r"no finished run of a member is there \(members: hexagon, redundant\)"):
-        with_finished(other, [finished.folder.parent], Console(file=text, width=300))
+        other.with_finished([finished.folder.parent], Console(file=text, width=300))
     assert "is left out; its tables are of other settings, or another version of a stage" in text.getvalue()
     assert not (tmp_path / "store").exists()
 
@@ -278,10 +278,10 @@ def test_a_run_with_a_changed_table_is_left_out_for_one_that_is_whole(finished, 
     shutil.copytree(whole, run)
     (run / "tables" / "eor.wedge.h5").write_bytes(b"")
     text = io.StringIO()
-    taken = with_finished(elsewhere(folder, tmp_path), [run, whole], Console(file=text, width=300))
+    taken = elsewhere(folder, tmp_path).with_finished([run, whole], Console(file=text, width=300))
     assert taken.finished == {"hexagon": whole}
     with pytest.raises(InputError, match="no finished run of a member is there"):
-        with_finished(elsewhere(folder, tmp_path), [run], Console(file=text, width=300))
+        elsewhere(folder, tmp_path).with_finished([run], Console(file=text, width=300))
     assert "tables/eor.wedge.h5 is not what the run wrote" in text.getvalue()
 
 
@@ -295,13 +295,13 @@ def test_other_results_in_the_store_are_not_passed_off_as_those_of_the_run(finis
     entry["files"]["eor.all-modes.csv"] = sha256(run / "tables" / "eor.all-modes.csv")
     (run / "manifest.json").write_text(json.dumps(manifest))
     there = elsewhere(folder, tmp_path)
-    assert with_finished(there, [run], Console(file=io.StringIO())).finished == {"hexagon": run}
+    assert there.with_finished([run], Console(file=io.StringIO())).finished == {"hexagon": run}
     # The same again is in the store already.
-    assert with_finished(there, [run], Console(file=io.StringIO())).finished == {"hexagon": run}
+    assert there.with_finished([run], Console(file=io.StringIO())).finished == {"hexagon": run}
     with pytest.raises(
         InputError, match=r"tables/eor\.all-modes\.csv differs from that of the same study in the store"
     ):
-        with_finished(there, [finished.parts["hexagon"].folder], Console(file=io.StringIO()))
+        there.with_finished([finished.parts["hexagon"].folder], Console(file=io.StringIO()))
 
 
 def test_a_member_of_which_more_than_tables_is_needed_is_run(finished, folder, tmp_path):
@@ -310,7 +310,7 @@ def test_a_member_of_which_more_than_tables_is_needed_is_run(finished, folder, t
         folder, figures=[], experiments=["hex.yaml", {"file": "hex.yaml", "name": "drawn", "overrides": NOISES}]
     )
     changes = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
-    taken = with_finished(load_study(path, overrides=changes), [finished.folder.parent], Console(file=text, width=300))
+    taken = load_study(path, overrides=changes).with_finished([finished.folder.parent], Console(file=text, width=300))
     write(folder)
     assert list(taken.finished) == ["hexagon"]
     assert "drawn: will be run (it has realizations; such members are always run)" in text.getvalue()
@@ -325,4 +325,4 @@ def test_a_member_of_which_more_than_tables_is_needed_is_run(finished, folder, t
 )
 def test_what_cannot_be_put_together_is_refused(finished, folder, file, place, told):
     with pytest.raises(InputError, match=told):
-        with_finished(load_study(folder / file), [finished.folder.parent / place], Console(file=io.StringIO()))
+        load_study(folder / file).with_finished([finished.folder.parent / place], Console(file=io.StringIO()))

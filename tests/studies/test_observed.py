@@ -18,12 +18,11 @@ from calstudy.experiment.files import validate
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import BEAMS, Channels
 from calstudy.power.average import fringe_stop_and_average
-from calstudy.power.expected import ExpectedBins
 from calstudy.power.interface import estimate_spectra
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
-from calstudy.power.transfer import TransferFunction
+from calstudy.power.transfer import ExpectedBins, TransferFunction
 from calstudy.products.files import DATA
 from calstudy.products.observed import observed as observed_task
 from calstudy.products.selection import read_gains

@@ -19,8 +19,7 @@ from pydantic import Field, ValidationError, model_validator
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import FileName, require_inside
-from calstudy.base.gain_files import read_gain_file, read_gains
-from calstudy.base.gain_tables import GainTable
+from calstudy.base.gain_files import GainTable, read_gain_file, read_gains
 from calstudy.base.gains import require_solutions, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost

@@ -27,7 +27,7 @@ from calstudy.results.reader import MANIFEST, RunFolder
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task
 from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
-from calstudy.studies.study import KINDS, Study, kind_of
+from calstudy.studies.study import KINDS, kind_of
 
 
 class Member(Section):
@@ -106,9 +106,33 @@ class Collection(Family):
                 )
         return cls(content, members, roles)
 
-    def without(self, finished: Mapping[str, Path]) -> Self:
-        """Return the collection with members that need not be run; see `finished`."""
-        return replace(self, finished={**self.finished, **finished})
+    def with_finished(self, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Self:
+        """Return the collection with members taken from finished runs of the same studies.
+
+        The tables of such a member are put into the store, and it is not run again. The console shows the run of each
+        member, and the reason why a run of its name is not used. With `planned`, the store does not change. Raises
+        InputError if no member is found, the store has other results of a member, or it cannot be written.
+        """
+        runs, store = find_finished(folders), Store(self.outputs.store)
+        taken: dict[str, tuple[FinishedRun, list[Task]]] = {}
+        for name, study in self.studies.items():
+            if (reason := _needs_more(self, name, study)) is not None:
+                console.print(f"{name}: will be run ({reason})", markup=False)
+                continue
+            if (run := _choose(name, study, runs, console)) is not None:
+                taken[name] = run, study.tables
+        if not taken:
+            given = ", ".join(str(folder) for folder in folders)
+            members = ", ".join(self.members)
+            raise InputError(f"--finished {given}: no finished run of a member is there (members: {members})")
+        for run, tables in taken.values():
+            for task in tables:
+                there = store.verify(task.stage.name, task.key)
+                if there is not None:
+                    _require_same(there, run.tables[task.key]["files"], run, store)
+                elif not planned:
+                    _put(task, run, store)
+        return replace(self, finished={**self.finished, **{name: run.folder for name, (run, _) in taken.items()}})
 
     def member(self, label: str) -> ExperimentStudy:
         """Return the study of a member, which may have realizations."""
@@ -308,38 +332,6 @@ def _read(folder: Path) -> FinishedRun | None:
     except (InputError, KeyError, TypeError, AttributeError):
         return None
     return FinishedRun(folder, run.manifest, tables)
-
-
-def with_finished(collection: Study, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Collection:
-    """Return a collection whose members are taken from finished runs of the same studies.
-
-    The tables of such a member are put into the store of the collection, and it is not run again. The console shows the
-    run of each member, and the reason why a run of its name is not used. With `planned`, the store does not change.
-    Raises InputError if the study is not a collection, no member is found, the store has other results of a member, or
-    it cannot be written.
-    """
-    if not isinstance(collection, Collection):
-        raise InputError("--finished: only a collection (a file with the key 'experiments') takes members from runs")
-    runs, store = find_finished(folders), Store(collection.outputs.store)
-    taken: dict[str, tuple[FinishedRun, list[Task]]] = {}
-    for name, study in collection.studies.items():
-        if (reason := _needs_more(collection, name, study)) is not None:
-            console.print(f"{name}: will be run ({reason})", markup=False)
-            continue
-        if (run := _choose(name, study, runs, console)) is not None:
-            taken[name] = run, study.tables
-    if not taken:
-        given = ", ".join(str(folder) for folder in folders)
-        members = ", ".join(collection.members)
-        raise InputError(f"--finished {given}: no finished run of a member is there (members: {members})")
-    for run, tables in taken.values():
-        for task in tables:
-            there = store.verify(task.stage.name, task.key)
-            if there is not None:
-                _require_same(there, run.tables[task.key]["files"], run, store)
-            elif not planned:
-                _put(task, run, store)
-    return collection.without({name: run.folder for name, (run, _) in taken.items()})
 
 
 def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], console: Console) -> FinishedRun | None:

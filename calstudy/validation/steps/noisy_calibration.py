@@ -29,13 +29,13 @@ from pyuvdata import UVData
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import flag_cube, to_cube
+from calstudy.calibrate.agreement import ALLOWED, PARTS, pooled
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.claims.bins import bins_at_delays, clustered_mean
 from calstudy.corrupt.effects.gains import ReflectionGains
 from calstudy.experiment.model import Variant
-from calstudy.figures.gain_coverage import ALLOWED, PARTS, pooled
 from calstudy.products import corruption, simulation, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
