@@ -258,6 +258,40 @@ def test_what_has_no_errors_says_why():
     assert "as many unknowns" in gain_errors(three.problem(), three.gains, three.foregrounds, FREQUENCIES)
 
 
+def fitted_with_a_weak_antenna(kind, weighting, size):
+    """Gains and their errors in a fit where antenna 2 receives the sky `size` times as well as others.
+
+    The noise is a tenth of the visibilities of others, and the same in all.
+    """
+    structure, sky, rms, known = parts_of(TEN, kind, 0.1, flagged=False)
+    drawn = 0.1 * rms * complex_normal(np.random.default_rng(3), sky.shape)
+    gains = TEN.gains * np.where(np.arange(len(TEN.gains)) == 2, size, 1)[:, None]
+    given = TEN.problem(structure, visibilities=gain_products(gains, structure.antennas) * sky + drawn, **known)
+    problem, solution = given, solve(given, GaussNewton())
+    for _ in range(6 if weighting == "gains" else 0):
+        problem = given.weighted_by(solution.gains)
+        solution = solve(replace(problem, initial_gains=solution.gains), GaussNewton())
+    return gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
+
+
+@pytest.mark.parametrize(("kind", "weighting"), [("sky", "flags"), ("sky", "gains"), ("calamity", "flags")])
+def test_an_antenna_whose_gains_are_noise_is_told_from_a_weak_one(kind, weighting):
+    """A dead antenna takes most of the weights of its fit, and the noise of all others with it."""
+    dead, weak = (fitted_with_a_weak_antenna(kind, weighting, size) for size in (0.0, 0.3))
+    assert np.array_equal(np.flatnonzero(dead.lost), [2])
+    assert not weak.lost.any()
+    # Others are determined as if it were not there: amplitudes by the sum over 8 baselines, twice the signal to noise
+    # of a visibility.
+    others = np.delete(dead.signal_to_noise, 2)
+    assert np.median(others) == pytest.approx(np.sqrt(2 * 8) * 10, rel=0.35)
+    if kind == "sky":
+        # The Rayleigh distribution has the median sqrt(log 4), and 64 channels scatter by 10 % of it.
+        assert dead.signal_to_noise[2] == pytest.approx(np.sqrt(np.log(4)), rel=0.3)
+        assert dead.noise_alone[2] == pytest.approx(np.sqrt(2))
+        # Its visibilities have a signal to noise of three.
+        assert weak.signal_to_noise[2] == pytest.approx(np.sqrt(2 * 9) * 3, rel=0.3)
+
+
 @pytest.mark.parametrize(("noise", "interference", "lost"), [(0.5, 0, False), (4.0, 0, True), (0.01, 100, False)])
 def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, lost):
     """Noise relative to the visibilities of a known sky; interference in a channel drives its gains as far as noise."""
@@ -274,4 +308,5 @@ def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, 
     errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
     warnings = lost_in_noise(solution.gains[..., None, None], errors.amplitude[..., None, None], errors.unevenness)
     assert len(warnings) == lost
+    assert lost or not errors.lost.any()
     assert all("integrations_per_solve" in text for text in warnings)
