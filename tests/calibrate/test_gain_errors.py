@@ -310,3 +310,31 @@ def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, 
     assert len(warnings) == lost
     assert lost or not errors.lost.any()
     assert all("integrations_per_solve" in text for text in warnings)
+
+
+def test_errors_of_gains_add_to_the_noise_of_baselines_that_were_not_fitted_alone():
+    """A fit takes as much noise out of the baselines that it fits as it has unknowns: 13 of 28 numbers per channel."""
+    sky, noise = SEVEN.foregrounds, 0.05
+    rms = np.sqrt(np.mean(np.abs(sky) ** 2))
+    fitted = np.arange(len(sky)) % 3 > 0
+    basis = make_basis(np.linalg.norm(SEVEN.vectors[fitted], axis=1), FREQUENCIES, BASIS)
+    structure = FitStructure.per_baseline(SEVEN.antennas[fitted], 7, basis)
+    products, powers, added = gain_products(SEVEN.gains, SEVEN.antennas), [], []
+    for number in range(REALIZATIONS):
+        drawn = noise * rms * complex_normal(np.random.default_rng([6, number]), sky.shape)
+        data = products * sky + drawn
+        known = {"sky_model": sky[fitted], "frozen": True, "weights": flag_weights(np.zeros(sky[fitted].shape, bool))}
+        problem = SEVEN.problem(structure, visibilities=data[fitted], **known)
+        found = solve(problem, GaussNewton()).gains
+        errors = gain_errors(problem, found, sky[fitted], FREQUENCIES)
+        variance = (errors.amplitude / np.abs(found)) ** 2 + errors.phase**2
+        added.append(np.abs(sky * products) ** 2 * variance[SEVEN.antennas].sum(axis=1))
+        misfit = (data / gain_products(found, SEVEN.antennas) - sky) * products
+        powers.append(np.abs(misfit) ** 2 / (noise * rms) ** 2)
+    power, added = np.mean(powers, axis=0), np.mean(added, axis=0) / (noise * rms) ** 2
+    # 36,000 samples of the noise, and gains of second order: 0.05^2 times a few.
+    assert power[fitted].mean() == pytest.approx(15 / 28, rel=0.03)
+    assert (1 + added[fitted]).mean() > 1.3
+    # Correlations of antennas, which errors do not have, make 8 % of it, by the inverse of the matrix of a channel.
+    assert power[~fitted].mean() == pytest.approx((1 + added[~fitted]).mean(), rel=0.15)
+    assert power[~fitted].mean() > 1.3
