@@ -72,8 +72,8 @@ SIMILAR = 0.05
 """Relative change of deviations of the foregrounds, or of the weights, that changes errors by less."""
 LOST = 2.0
 """Signal to noise, over that which noise alone makes, below which gains of an antenna are lost. In fits to 7 and 10
-antennas a dead one has 0.8 to 1.4 with known foregrounds, 0.3 to 2.4 with free ones. One whose visibilities are as
-large as the noise has 2.3 to 2.8 and 1.0 to 2.6; three times as large, 3.1 or more."""
+antennas a dead one has 0.9 to 1.5 with known foregrounds, 1.2 to 2.5 with free ones. One whose visibilities are as
+large as the noise has 1.5 to 3.6; three times as large, 3.7 or more."""
 LEAST = 0.1
 """Least fraction of the noise that is taken to be left in the residual."""
 NoiseFrom = Literal["weights", "residual"]
