@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import yaml
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.base.gains import draw_gains, read_gain_errors
 from calstudy.experiment.files import StudyFile
 from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
@@ -162,6 +163,16 @@ class CalibratedData:
     def gain_errors(self) -> xarray.Dataset:
         """Standard deviations of gains by noise, `amplitude` and `phase`; InputError if the calibration has none."""
         return gain_errors(self.folder / GAINS)
+
+    def draw_gains(self, seed: int) -> UVCal:
+        """Return the gains with a draw of their errors, for errors of baselines that were not fitted.
+
+        The noise of fitted baselines is not independent of that of their gains, and needs no draws. Raises InputError
+        if the calibration has no errors.
+        """
+        records = self.solution["records"]
+        solves = [slice(at := record["integration"], at + record["n_integrations"]) for record in records]
+        return draw_gains(self.gains, read_gain_errors(self.folder / GAINS), solves, seed)
 
     @property
     def model(self) -> UVData:

@@ -6,6 +6,7 @@ by g_a g_b*.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -121,6 +122,21 @@ def read_gain_errors(path: Path) -> tuple[np.ndarray, np.ndarray]:
             "wrote none"
         )
     return found[0], found[1]
+
+
+def draw_gains(cal: UVCal, errors: tuple[np.ndarray, np.ndarray], solves: Sequence[slice], seed: int) -> UVCal:
+    """Return gains that deviate from given ones by a draw of their errors, independent by antenna and channel.
+
+    Errors are those of `read_gain_errors`; gains without an error stay as they are. Integrations that were solved
+    together, `solves`, have one deviation.
+    """
+    deviation = np.random.default_rng(seed).standard_normal((2, *cal.gain_array.shape))
+    for times in solves:
+        deviation[..., times, :] = deviation[..., times.start : times.start + 1, :]
+    amplitude, phase = deviation * np.nan_to_num([errors[0] / np.abs(cal.gain_array), errors[1]])
+    drawn = cal.copy()
+    drawn.gain_array = cal.gain_array * np.exp(amplitude + 1j * phase)
+    return drawn
 
 
 def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,6 +38,12 @@ from the matrix of each channel with known foregrounds. Errors agree with those 
 The exception are phases beside channels that are flagged for one antenna alone: these are relative to a mean that it
 does not determine there, and get too small an error.
 
+Where an antenna receives nothing but noise, its gains are what the fit makes of noise: the modulus of a gain over its
+error has a mean square of two if foregrounds are known, and more by the noise that free foregrounds follow on the
+baselines of the antenna. `GainErrors.lost` are antennas with less than `LOST` times this. Their signal to noise is for
+given foregrounds and for the noise of their own baselines, the median over these and channels: one broken antenna
+changes the noise that all gains have in common, and the foregrounds of all.
+
 What foregrounds absorb takes most of the time. It changes variances by a factor over those of known foregrounds, which
 hardly changes while the sky turns by less than a fringe, and which `ErrorsInTime` keeps for that time.
 """
@@ -64,6 +70,12 @@ TURNS_PER_DAY = 1.00274
 """Of the sky."""
 SIMILAR = 0.05
 """Relative change of deviations of the foregrounds, or of the weights, that changes errors by less."""
+LOST = 2.0
+"""Signal to noise, over that which noise alone makes, below which gains of an antenna are lost. In fits to 7 and 10
+antennas a dead one has 0.9 to 1.5 with known foregrounds, 1.2 to 2.5 with free ones. One whose visibilities are as
+large as the noise has 1.5 to 3.6; three times as large, 3.7 or more."""
+LEAST = 0.1
+"""Least fraction of the noise that is taken to be left in the residual."""
 NoiseFrom = Literal["weights", "residual"]
 
 
@@ -96,6 +108,8 @@ class GainErrors:
     unevenness : mean over median of the residual's power in channels: about one for noise, more for interference
     determined : function that takes these directions out of a relative change of the gains, complex, (Nants, Nfreqs)
     absorbed : what foregrounds absorb
+    signal_to_noise : of |g| of each antenna for given foregrounds, the median over channels, (Nants,)
+    noise_alone : what noise alone makes of it, (Nants,)
     """
 
     amplitude: np.ndarray = field(metadata={"unit": ""})
@@ -108,6 +122,13 @@ class GainErrors:
     unevenness: float
     determined: Callable[[np.ndarray], np.ndarray]
     absorbed: Absorption
+    signal_to_noise: np.ndarray
+    noise_alone: np.ndarray
+
+    @property
+    def lost(self) -> np.ndarray:
+        """Whether the gains of an antenna cannot be told from those of noise, (Nants,)."""
+        return self.signal_to_noise < LOST * self.noise_alone
 
     def summary(self, gains: np.ndarray) -> dict[str, Any]:
         """Return the median errors and signal to noise, and what they mean, as plain JSON types."""
@@ -164,7 +185,8 @@ def gain_errors(
             variances = as_a_whole(tangent, structure.antennas, alignment, spans)
         else:
             variances = by_antenna(tangent, structure.antennas, alignment, spans, known)
-    residual = problem.visibilities - gain_products(gains, structure.antennas) * model
+    fitted = gain_products(gains, structure.antennas) * model
+    residual = problem.visibilities - fitted
     powers = np.sum(problem.weights * np.abs(residual) ** 2, axis=0)
     loss, powers = float(np.sum(powers)), powers[has_data.any(axis=0)]
     sigma = np.where(has_data, np.sqrt(variances * (0.5 if tangent.finite else loss / degrees)), np.nan)
@@ -185,7 +207,33 @@ def gain_errors(
         float(np.mean(powers) / np.median(powers)) if loss > 0 else 1.0,
         determined,
         Absorption(np.divide(variances, known, out=np.zeros(known.shape), where=known > 0), sequences),
+        *_signal_to_noise(problem, fitted, residual, sequences if free else 0),
     )
+
+
+def _signal_to_noise(
+    problem: CalibrationProblem, fitted: np.ndarray, residual: np.ndarray, sequences: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signal to noise of each antenna, and what noise alone makes of it, (Nants,); NaN without data.
+
+    Parameters
+    ----------
+    fitted, residual : g_a g_b* F, and what is left of the data, (Nbls, Nfreqs)
+    sequences : number of complex numbers in the data that free foregrounds follow
+    """
+    used, found = problem.weights > 0, np.full((2, problem.structure.n_antennas), np.nan)
+    for antenna in range(problem.structure.n_antennas):
+        own = (problem.structure.antennas == antenna).any(axis=1)
+        samples, channels = used[own].sum(), used[own].any(axis=0)
+        if not samples:
+            continue
+        signal = np.sum(np.abs(fitted[own]) ** 2, axis=0, where=used[own])[channels]
+        followed = channels.sum() / samples + sequences / used.sum()
+        # The median: interference in some channels, and a broken antenna at the other end, do not count.
+        noise = np.median(np.abs(residual[own][used[own]]) ** 2) / np.log(2) / max(1 - followed, LEAST)
+        found[0, antenna] = np.sqrt(2 * np.median(signal) / noise) if noise > 0 else np.inf
+        found[1, antenna] = np.sqrt(2 * followed * samples / channels.sum())
+    return found[0], found[1]
 
 
 class _Last(NamedTuple):

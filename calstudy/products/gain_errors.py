@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -35,6 +35,8 @@ FAR_ABOVE, MODERATE, EVEN = 5.0, 20.0, 2.0
 """|g| over the median of its antenna, the signal to noise below which noise alone can make it, and the unevenness of
 the residual above which something else does."""
 RAN_AWAY = "the weights, from the gains, do not settle: the gains are lost in noise"
+NAMED = 6
+"""Largest number of antennas named in a warning; solution.json has all of them."""
 REMEDY = "solve more integrations together (integrations_per_solve), or smooth the gains (smooth_gains)"
 
 
@@ -133,8 +135,8 @@ class OfSolves(Calibrated):
         return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
-class ErrorsOfGains(OfSolves, stage="gain-errors", version=4):
-    """The gains of a calibration with their errors."""
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
+    """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged."""
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the gains with their errors, and a record for each solve."""
@@ -145,17 +147,41 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=4):
             if isinstance(solve.errors, str):
                 records.append({"reason": solve.errors})
                 continue
+            lost = solve.errors.lost
             found = np.stack([solve.errors.amplitude, solve.errors.phase])
+            found[:, lost] = np.nan
             errors[..., solve.place][:, solve.rows, :, solve.times] = found[..., None]
-            records.append(solve.errors.summary(solve.gains))
+            result.gains.flag_array[solve.rows[lost], :, solve.times, solve.place] = True
+            names = result.gains.ant_array[solve.rows[lost]].tolist()
+            both = np.round([solve.errors.signal_to_noise[lost], solve.errors.noise_alone[lost]], 2).T.tolist()
+            records.append(solve.errors.summary(solve.gains) | {"lost_antennas": dict(zip(names, both, strict=True))})
         result.gains.write_calh5(output / GAINS)
         if np.isfinite(errors).any():
             write_gain_errors(output / GAINS, *errors)
         write_json(output / ERRORS, {"records": records})
-        lost = sum(record.get("reason") == RAN_AWAY for record in records)
-        warnings = [f"{lost} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if lost else []
+        away = sum(record.get("reason") == RAN_AWAY for record in records)
+        warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if away else []
+        warnings += lost_antennas(records)
         unevenness = max((record["unevenness"] for record in records if "reason" not in record), default=1.0)
         return {"warnings": warnings + lost_in_noise(result.gains.gain_array, errors[0], unevenness)}
+
+
+def lost_antennas(records: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a sentence that names the antennas whose gains are flagged in some of the solves; none without any."""
+    found: dict[int, list[list[float]]] = {}
+    for record in records:
+        for number, pair in record.get("lost_antennas", {}).items():
+            found.setdefault(number, []).append(pair)
+    if not found:
+        return []
+    worst = sorted(found, key=lambda number: (-len(found[number]), min(found[number])))
+    named = ", ".join(
+        f"{number} ({min(found[number])[0]:.1f} against {min(found[number])[1]:.1f} by noise alone, in "
+        f"{len(found[number])} of {len(records)} solves)"
+        for number in worst[:NAMED]
+    )
+    more = f" and {len(worst) - NAMED} more" if len(worst) > NAMED else ""
+    return [f"antennas that cannot be calibrated are flagged; signal to noise of their gains: {named}{more}"]
 
 
 def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> list[str]:

@@ -17,9 +17,11 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
+from calstudy.base.gains import gain_products
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
+from calstudy.base.visibilities import antenna_pairs, flag_cube
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
@@ -27,7 +29,15 @@ from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
-from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, read_json
+from calstudy.products.files import (
+    GAINS,
+    MODEL,
+    RESIDUAL,
+    SOLUTION,
+    read_json,
+    read_visibilities,
+    write_visibilities,
+)
 from calstudy.products.gain_errors import ERRORS, observed_gain_errors
 from calstudy.products.graph import MeasuredGraph
 from calstudy.products.observed import calibrated, observed
@@ -252,6 +262,8 @@ class DataCalibration(DataStudy):
                     record["gain_errors"] = found
             for name in (QUALITY, ERRORS):
                 (work / name).unlink(missing_ok=True)
+            if any(record.get("gain_errors", {}).get("lost_antennas") for record in solution["records"]):
+                flag_unsolved(work)
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
             self._write_gains_also(work)
             for path in work.iterdir():
@@ -293,6 +305,20 @@ class DataCalibration(DataStudy):
             "seconds": sum(record["seconds"] for record in solved["records"]),
             "records": solved["records"],
         }
+
+
+def flag_unsolved(folder: Path) -> None:
+    """Flag model and residual in a folder where its gains are flagged."""
+    from pyuvdata import UVCal
+
+    gains = UVCal.from_file(folder / GAINS)
+    for name in (MODEL, RESIDUAL):
+        data = read_visibilities(folder / name)
+        flag_cube(data)[gain_products(gains, antenna_pairs(data))[1]] = True
+        if name == RESIDUAL:
+            data.data_array[data.flag_array] = 0
+        (folder / name).unlink()
+        write_visibilities(data, folder / name, single=True)
 
 
 def calibration_file(sections: Mapping[str, Any], output: Path, overrides: Sequence[str] = ()) -> StudyFile:

@@ -323,3 +323,28 @@ def test_gains_have_their_errors_beside_what_other_readers_see(command, finished
     assert "restricted to smooth functions" in smooth.solution["records"][0]["gain_errors"]["reason"]
     with pytest.raises(InputError, match="has no errors of gains"):
         _ = smooth.gain_errors
+
+
+def test_an_antenna_that_cannot_be_calibrated_is_flagged_with_its_number(command, toy, data, tmp_path):
+    uvd, rng = UVData.from_file(str(data)), np.random.default_rng(5)
+    # The fourth antenna.
+    dead = (uvd.ant_1_array == 16) | (uvd.ant_2_array == 16)
+    rms = np.sqrt(np.mean(np.abs(toy.noise) ** 2))
+    uvd.data_array[dead] = rms * (rng.standard_normal((2, *uvd.data_array[dead].shape)).T @ [1, 1j]).T / np.sqrt(2)
+    uvd.write_uvh5(str(data), clobber=True)
+    options = [*OPTIONS, "--set", "weights=flags", "--also", "calfits"]
+    _, told = command(data, *options, "--output", "out")
+    assert re.search(
+        r"cannot be calibrated are flagged; .*: 16 \([0-9.]+ against [0-9.]+ by noise alone, in 2 of", told
+    )
+    found = CalibratedData(tmp_path / "out")
+    for gains in (found.gains, UVCal.from_file(str(tmp_path / "out" / "gains.calfits"))):
+        assert np.array_equal(gains.flag_array.all(axis=(1, 2, 3)), gains.ant_array == 16)
+    for record in found.solution["records"]:
+        signal_to_noise, noise_alone = record["gain_errors"]["lost_antennas"]["16"]
+        assert 0 < signal_to_noise < 2 * noise_alone
+    for written in (found.model, found.residual):
+        assert np.array_equal(written.flag_array.all(axis=(1, 2)), dead)
+    assert not found.residual.data_array[dead].any()
+    command(data, *options, "--output", "plain", "--no-gain-errors")
+    assert not CalibratedData(tmp_path / "plain").gains.flag_array.all(axis=(1, 2, 3)).any()

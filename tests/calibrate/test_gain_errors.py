@@ -258,6 +258,40 @@ def test_what_has_no_errors_says_why():
     assert "as many unknowns" in gain_errors(three.problem(), three.gains, three.foregrounds, FREQUENCIES)
 
 
+def fitted_with_a_weak_antenna(kind, weighting, size):
+    """Gains and their errors in a fit where antenna 2 receives the sky `size` times as well as others.
+
+    The noise is a tenth of the visibilities of others, and the same in all.
+    """
+    structure, sky, rms, known = parts_of(TEN, kind, 0.1, flagged=False)
+    drawn = 0.1 * rms * complex_normal(np.random.default_rng(3), sky.shape)
+    gains = TEN.gains * np.where(np.arange(len(TEN.gains)) == 2, size, 1)[:, None]
+    given = TEN.problem(structure, visibilities=gain_products(gains, structure.antennas) * sky + drawn, **known)
+    problem, solution = given, solve(given, GaussNewton())
+    for _ in range(6 if weighting == "gains" else 0):
+        problem = given.weighted_by(solution.gains)
+        solution = solve(replace(problem, initial_gains=solution.gains), GaussNewton())
+    return gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
+
+
+@pytest.mark.parametrize(("kind", "weighting"), [("sky", "flags"), ("sky", "gains"), ("calamity", "flags")])
+def test_an_antenna_whose_gains_are_noise_is_told_from_a_weak_one(kind, weighting):
+    """A dead antenna takes most of the weights of its fit, and the noise of all others with it."""
+    dead, weak = (fitted_with_a_weak_antenna(kind, weighting, size) for size in (0.0, 0.3))
+    assert np.array_equal(np.flatnonzero(dead.lost), [2])
+    assert not weak.lost.any()
+    # Others are determined as if it were not there: amplitudes by the sum over 8 baselines, twice the signal to noise
+    # of a visibility.
+    others = np.delete(dead.signal_to_noise, 2)
+    assert np.median(others) == pytest.approx(np.sqrt(2 * 8) * 10, rel=0.35)
+    if kind == "sky":
+        # The Rayleigh distribution has the median sqrt(log 4), and 64 channels scatter by 10 % of it.
+        assert dead.signal_to_noise[2] == pytest.approx(np.sqrt(np.log(4)), rel=0.3)
+        assert dead.noise_alone[2] == pytest.approx(np.sqrt(2))
+        # Its visibilities have a signal to noise of three.
+        assert weak.signal_to_noise[2] == pytest.approx(np.sqrt(2 * 9) * 3, rel=0.3)
+
+
 @pytest.mark.parametrize(("noise", "interference", "lost"), [(0.5, 0, False), (4.0, 0, True), (0.01, 100, False)])
 def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, lost):
     """Noise relative to the visibilities of a known sky; interference in a channel drives its gains as far as noise."""
@@ -274,4 +308,33 @@ def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, 
     errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
     warnings = lost_in_noise(solution.gains[..., None, None], errors.amplitude[..., None, None], errors.unevenness)
     assert len(warnings) == lost
+    assert lost or not errors.lost.any()
     assert all("integrations_per_solve" in text for text in warnings)
+
+
+def test_errors_of_gains_add_to_the_noise_of_baselines_that_were_not_fitted_alone():
+    """A fit takes as much noise out of the baselines that it fits as it has unknowns: 13 of 28 numbers per channel."""
+    sky, noise = SEVEN.foregrounds, 0.05
+    rms = np.sqrt(np.mean(np.abs(sky) ** 2))
+    fitted = np.arange(len(sky)) % 3 > 0
+    basis = make_basis(np.linalg.norm(SEVEN.vectors[fitted], axis=1), FREQUENCIES, BASIS)
+    structure = FitStructure.per_baseline(SEVEN.antennas[fitted], 7, basis)
+    products, powers, added = gain_products(SEVEN.gains, SEVEN.antennas), [], []
+    for number in range(REALIZATIONS):
+        drawn = noise * rms * complex_normal(np.random.default_rng([6, number]), sky.shape)
+        data = products * sky + drawn
+        known = {"sky_model": sky[fitted], "frozen": True, "weights": flag_weights(np.zeros(sky[fitted].shape, bool))}
+        problem = SEVEN.problem(structure, visibilities=data[fitted], **known)
+        found = solve(problem, GaussNewton()).gains
+        errors = gain_errors(problem, found, sky[fitted], FREQUENCIES)
+        variance = (errors.amplitude / np.abs(found)) ** 2 + errors.phase**2
+        added.append(np.abs(sky * products) ** 2 * variance[SEVEN.antennas].sum(axis=1))
+        misfit = (data / gain_products(found, SEVEN.antennas) - sky) * products
+        powers.append(np.abs(misfit) ** 2 / (noise * rms) ** 2)
+    power, added = np.mean(powers, axis=0), np.mean(added, axis=0) / (noise * rms) ** 2
+    # 36,000 samples of the noise, and gains of second order: 0.05^2 times a few.
+    assert power[fitted].mean() == pytest.approx(15 / 28, rel=0.03)
+    assert (1 + added[fitted]).mean() > 1.3
+    # Correlations of antennas, which errors do not have, make 8 % of it, by the inverse of the matrix of a channel.
+    assert power[~fitted].mean() == pytest.approx((1 + added[~fitted]).mean(), rel=0.15)
+    assert power[~fitted].mean() > 1.3
