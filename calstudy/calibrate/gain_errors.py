@@ -127,7 +127,16 @@ class GainErrors:
 
     @property
     def lost(self) -> np.ndarray:
-        """Whether the gains of an antenna cannot be told from those of noise, (Nants,)."""
+        """Whether the gains of an antenna cannot be told from those of noise, (Nants,); none if `drowned`."""
+        return self._as_noise & ~self.drowned
+
+    @property
+    def drowned(self) -> bool:
+        """Whether most antennas cannot be told from noise, so that there is too much of it for all of them."""
+        return 2 * np.count_nonzero(self._as_noise) > len(self._as_noise)
+
+    @property
+    def _as_noise(self) -> np.ndarray:
         return self.signal_to_noise < LOST * self.noise_alone
 
     def summary(self, gains: np.ndarray) -> dict[str, Any]:

@@ -143,11 +143,13 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         result = read_result(self.calibration)
         errors = np.full((2, *result.gains.gain_array.shape), np.nan)
         records: list[dict[str, Any]] = []
+        drowned = 0
         for solve in self.solves(result):
             if isinstance(solve.errors, str):
                 records.append({"reason": solve.errors})
                 continue
             lost = solve.errors.lost
+            drowned += solve.errors.drowned
             found = np.stack([solve.errors.amplitude, solve.errors.phase])
             found[:, lost] = np.nan
             errors[..., solve.place][:, solve.rows, :, solve.times] = found[..., None]
@@ -161,6 +163,11 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         write_json(output / ERRORS, {"records": records})
         away = sum(record.get("reason") == RAN_AWAY for record in records)
         warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if away else []
+        if drowned:
+            warnings.append(
+                f"{drowned} of {len(records)} solves: the gains of most antennas cannot be told from noise, and none "
+                f"is flagged; {REMEDY}"
+            )
         warnings += lost_antennas(records)
         unevenness = max((record["unevenness"] for record in records if "reason" not in record), default=1.0)
         return {"warnings": warnings + lost_in_noise(result.gains.gain_array, errors[0], unevenness)}

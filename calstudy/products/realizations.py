@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -194,6 +194,14 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
         factor = read_json(self.levels / LEVELS)["eor_factor"]
         write_json(output / INPUT, {"power_mk2_h3_mpc3": (factor**2 * put_in).tolist()})
         return {}
+
+    def _cost(self) -> Cost:
+        if self.band is None or self.eor_settings.path is None:
+            return self.typical
+        from calstudy.sky.boxes import MEMORY_PER_CELL, read_box
+
+        cells = read_box(self.eor_settings.path).n_cells(self.band)
+        return replace(self.typical, memory=self.typical.memory + MEMORY_PER_CELL * cells)
 
 
 def read_samples(folders: Mapping[str, Path], count: int, region: str) -> Sequence[Sample]:

@@ -5,10 +5,11 @@ is about 36 Mpc wide, and a cell 1 to 2 Mpc: samples of a box at the centres of 
 scales, and averages within pixels need boxes for the whole sky. What is measured, T, bias and power, are second
 moments, which the power spectrum decides.
 
-Layouts, by py21cmfast 3.0 to 4.2: version 3 has ``BrightnessTemp/brightness_temp`` or ``lightcones/brightness_temp``
-with the attributes of ``user_params`` and ``cosmo_params``; version 4 puts fields and parameters of a box into
-``BrightnessTemp/OutputFields`` and ``BrightnessTemp/InputParameters``, and the parameters of a lightcone into
-``InputParameters``. Brightness is in mK and lengths are in Mpc, without h.
+Layouts, by py21cmfast 3.0 to 4.2 (files of 3.4.0 and 4.1.1 were read): version 3 has
+``BrightnessTemp/brightness_temp`` or ``lightcones/brightness_temp`` with the attributes of ``user_params`` and
+``cosmo_params``; version 4 puts fields and parameters of a box into ``BrightnessTemp/OutputFields`` and
+``BrightnessTemp/InputParameters``, and the parameters of a lightcone into ``InputParameters``. Brightness is in mK and
+lengths are in Mpc, without h.
 """
 
 from __future__ import annotations
@@ -193,7 +194,9 @@ def _read(path: Path, modified: int, size: int) -> Box:
             if file[name].ndim != 3 or min(file[name].shape) < 2:
                 raise _refused(path, f"{name} has shape {file[name].shape}; use a box or a rectilinear lightcone")
             return _lightcone(path, file, name) if name.startswith("lightcones") else _coeval(path, file, name)
-    except (OSError, KeyError, TypeError) as error:
+    except InputError:
+        raise
+    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise _refused(path, f"cannot be read as a file of 21cmFAST 3 or 4 ({error})") from None
 
 
@@ -230,15 +233,16 @@ def _parameters(group: h5py.Group) -> tuple[Mapping[str, Any], Mapping[str, Any]
     """Return the parameters of the size, and those of the cosmology, in the names of 21cmFAST."""
     if "InputParameters" in group:
         found = group["InputParameters"]
-        return found["simulation_options"].attrs, found["cosmo_params"].attrs
+        size = dict(found["simulation_options"].attrs)
+        # Versions before 4.0.0 wrote the size under another name where it is not the default.
+        default = {} if "_BOX_LEN" in size else {"LOWRES_CELL_SIZE_MPC": DEFAULT_CELL}
+        return default | size, found["cosmo_params"].attrs
     return group["user_params"].attrs, group["cosmo_params"].attrs
 
 
 def _cell(size: Mapping[str, Any], shape: tuple[int, ...]) -> float:
     """Return the size of a cell, Mpc."""
-    if "BOX_LEN" in size:
-        return float(size["BOX_LEN"]) / shape[0]
-    return float(size.get("LOWRES_CELL_SIZE_MPC", DEFAULT_CELL))
+    return float(size["BOX_LEN"]) / shape[0] if "BOX_LEN" in size else float(size["LOWRES_CELL_SIZE_MPC"])
 
 
 def _refused(path: Path, sentence: str) -> InputError:

@@ -280,6 +280,7 @@ def test_an_antenna_whose_gains_are_noise_is_told_from_a_weak_one(kind, weightin
     dead, weak = (fitted_with_a_weak_antenna(kind, weighting, size) for size in (0.0, 0.3))
     assert np.array_equal(np.flatnonzero(dead.lost), [2])
     assert not weak.lost.any()
+    assert not dead.drowned
     # Others are determined as if it were not there: amplitudes by the sum over 8 baselines, twice the signal to noise
     # of a visibility.
     others = np.delete(dead.signal_to_noise, 2)
@@ -308,7 +309,9 @@ def test_gains_that_are_lost_in_noise_are_told_from_others(noise, interference, 
     errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
     warnings = lost_in_noise(solution.gains[..., None, None], errors.amplitude[..., None, None], errors.unevenness)
     assert len(warnings) == lost
-    assert lost or not errors.lost.any()
+    assert not errors.lost.any()
+    # With noise of four times the visibilities no antenna is at fault.
+    assert errors.drowned == lost
     assert all("integrations_per_solve" in text for text in warnings)
 
 

@@ -187,6 +187,13 @@ def test_sizes_of_version_4(tmp_path):
         assert read_box(path).cell == cell
 
 
+@pytest.mark.parametrize(("version", "size"), [(3, {"DIM": 12}), (4, {"_BOX_LEN": 8.0}), (4, {"BOX_LEN": "none"})])
+def test_a_box_of_unknown_size_is_refused(tmp_path, version, size):
+    path = coeval(tmp_path / "box.h5", np.zeros((4, 4, 4), np.float32), version, size=size)
+    with pytest.raises(InputError, match="cannot be read as a file of 21cmFAST"):
+        read_box(path)
+
+
 def test_parts_of_a_lightcone(tmp_path):
     """A band at an end takes what is there; a deep band takes all of its redshifts; buffers are left out."""
     noise = np.random.default_rng(1).standard_normal((CELLS, CELLS, 100)).astype(np.float32)
