@@ -133,7 +133,7 @@ class GainErrors:
     @property
     def drowned(self) -> bool:
         """Whether most antennas cannot be told from noise, so that there is too much of it for all of them."""
-        return 2 * np.count_nonzero(self._as_noise) > len(self._as_noise)
+        return bool(2 * np.count_nonzero(self._as_noise) > len(self._as_noise))
 
     @property
     def _as_noise(self) -> np.ndarray:
