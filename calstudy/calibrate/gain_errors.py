@@ -128,7 +128,7 @@ class GainErrors:
     @property
     def lost(self) -> np.ndarray:
         """Whether the gains of an antenna cannot be told from those of noise, (Nants,); none if `drowned`."""
-        return self._as_noise & ~self.drowned
+        return self._as_noise & (not self.drowned)
 
     @property
     def drowned(self) -> bool:
