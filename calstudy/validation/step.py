@@ -109,9 +109,7 @@ class StepInput(Tables):
 
     def input_power(self, k: np.ndarray) -> np.ndarray:
         """Return the input P(k), scaled as the data are, mK^2 h^-3 Mpc^3, at `k` in h/Mpc."""
-        experiment = self.experiment
-        band = experiment.instrument.channels.band
-        power = input_power(experiment.sky.eor, k, experiment.power.cosmology, band)
+        power = input_power(self.experiment.sky.eor, k, self.experiment.power.cosmology)
         return self.levels.eor_factor**2 * power
 
     def delay_spectra(self, product: str) -> DelaySpectra:
