@@ -1,11 +1,7 @@
-"""Spherical power spectra with 95 % bars, of one array or two (the paper's Figs. SPHERICAL*), and published limits.
-
-Tables of limits have Delta^2(k) = k^3 P(k) / (2 pi^2) by redshift.
-"""
+"""Spherical power spectra with 95 % bars, of one array or two (the paper's Figs. SPHERICAL*)."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +12,10 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
 
 from calstudy.base.constants import SIGMAS_95
-from calstudy.base.errors import InputError
-from calstudy.base.package_files import published
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.cosmology import redshift
+from calstudy.power.limits import WITHIN, Limits, limits_near, published_limits, read_limits
 from calstudy.results.reader import Tables
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
@@ -33,77 +28,6 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment
     from calstudy.power.spectra import SphericalSpectrum
     from calstudy.products.graph import Graph
-
-COLUMNS = ("name", "reference", "z", "k", "delta2")
-WITHIN = 0.5
-"""Largest difference in redshift of limits that are compared with a spectrum."""
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """The upper limits of a publication at one redshift, in ascending k.
-
-    Attributes
-    ----------
-    name, reference : what they are called, and where they were published
-    redshift : of the middle of their band
-    k : h/Mpc, (Nk,)
-    delta2 : upper limits of Delta^2, mK^2, (Nk,)
-    """
-
-    name: str
-    reference: str
-    redshift: float
-    k: np.ndarray
-    delta2: np.ndarray
-
-    @property
-    def power(self) -> np.ndarray:
-        """The upper limits of P(k), mK^2 h^-3 Mpc^3, (Nk,)."""
-        return self.delta2 * 2 * np.pi**2 / self.k**3
-
-
-def published_limits() -> Path:
-    """Return the table of published limits that comes with calstudy."""
-    return published("experiments") / "published-limits.csv"
-
-
-def read_limits(path: Path) -> list[Limits]:
-    """Read a CSV with the columns of `COLUMNS`: k in h/Mpc, delta2 in mK^2; a row for each k.
-
-    Raises InputError if the file is no such table, or has a number that is not positive.
-    """
-    found: dict[tuple[str, str, float], list[tuple[float, float]]] = {}
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            table = csv.DictReader(file)
-            if missing := [name for name in COLUMNS if name not in (table.fieldnames or ())]:
-                raise InputError(f"{path}: has no column {', '.join(missing)}; it needs {', '.join(COLUMNS)}")
-            for row in table:
-                z, k, delta2 = (_positive(row[name], name, path, table.line_num) for name in COLUMNS[2:])
-                found.setdefault((row["name"], row["reference"], z), []).append((k, delta2))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as a table of limits ({error})") from None
-    return [Limits(*key, *np.array(sorted(points)).T) for key, points in found.items()]
-
-
-def _positive(text: str | None, name: str, path: Path, line: int) -> float:
-    try:
-        number = float(text or "")
-    except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise InputError(f"{path}, line {line}: {name} = {text!r} is not a positive number")
-    return number
-
-
-def limits_near(found: Sequence[Limits], redshift: float) -> list[Limits]:
-    """Return the limits of each name at its redshift closest to the given one, of those within `WITHIN`."""
-    closest: dict[str, Limits] = {}
-    for limits in sorted(found, key=lambda limits: abs(limits.redshift - redshift)):
-        if abs(limits.redshift - redshift) <= WITHIN:
-            closest.setdefault(limits.name, limits)
-    return list(closest.values())
 
 
 @dataclass(frozen=True)

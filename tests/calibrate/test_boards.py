@@ -14,8 +14,9 @@ from toy import FREQUENCIES, Toy, make_toy, scattered
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+from calstudy.calibrate.boards import Boards
 from calstudy.calibrate.calibrators.least_squares import SkyBased
-from calstudy.calibrate.calibrators.other_packages import Boards, Skycal
+from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibration, Calibrator, DpssSmoothing, Solve
 from calstudy.calibrate.problem import gain_products

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.colors import same_color, to_rgba
 
-from calstudy.figures.spherical import MARKINGS, Limits, draw_spherical, draw_spherical_comparison
+from calstudy.figures.spherical import MARKINGS, draw_spherical, draw_spherical_comparison
+from calstudy.power.limits import Limits
 
 CAPTION = {
     "uncorrupted": ("o", "#000000"),

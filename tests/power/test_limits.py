@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calstudy.base.errors import InputError
-from calstudy.figures.spherical import Limits, Spherical, limits_near, published_limits, read_limits
+from calstudy.figures.spherical import Spherical
+from calstudy.power.limits import Limits, limits_near, published_limits, read_limits
 
 HEADING = "name,reference,z,k,delta2\n"
 
