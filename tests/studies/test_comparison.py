@@ -10,6 +10,7 @@ from test_signal_loss import small
 
 import calstudy
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.experiment.assumed import assumed_changes
 from calstudy.experiment.files import load
 from calstudy.power.score import BANDS, Score
 from calstudy.power.tables import load_spectrum
@@ -219,6 +220,30 @@ def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_p
         load_study(path, overrides=["figures.0=comparison-matrix"])
     with pytest.raises(ExperimentError, match=r"sky\.eor\.sed"):
         load_study(comparison_file(tmp_path), overrides=["worlds={ideal: {sky.eor.sed: 9}}"])
+
+
+def test_what_the_experiment_assumes_is_kept_where_a_calibrator_does_not_say_otherwise(tmp_path):
+    calibrators = {
+        "trusting": "sky-based",
+        "knowing": {"calibrator": "sky-based", "assumed": {"sky.foregrounds.flux_limit": "2 Jy"}},
+    }
+    worlds = {"scatter": {}, "larger": {"calibration.assumed.sky.foregrounds.errors": {"flux_scatter": 0.2}}}
+    path = comparison_file(tmp_path, calibrators=calibrators, worlds=worlds)
+    base = yaml.safe_load((tmp_path / "base.yaml").read_text())
+    base["calibration"]["assumed"] = {"sky.foregrounds.errors": {"flux_scatter": 0.1}, "sky.foregrounds.count": 9}
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(base))
+    study = load_study(path)
+    assumed = {
+        (case.calibrator, case.world): assumed_changes(case.experiment.calibration.assumed) for case in study.cases
+    }
+    errors = "sky.foregrounds.errors.flux_scatter"
+    count = "sky.foregrounds.count"
+    assert {key: (value.get(errors), value.get(count)) for key, value in assumed.items()} == {
+        ("trusting", "scatter"): (0.1, 9),
+        ("trusting", "larger"): (0.2, 9),
+        ("knowing", "scatter"): (None, None),
+        ("knowing", "larger"): (0.2, None),
+    }
 
 
 def test_the_file_in_the_run_folder_is_the_same_comparison(compared, tmp_path):

@@ -47,7 +47,7 @@ from calstudy.studies.study import KINDS, kind_of
 
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
-"""Keys of the experiment that the cases do not take from it."""
+"""Keys of the experiment that the cases do not take from it, but for `calibration.assumed`."""
 OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
 """Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
 VARIANTS_NEEDED = (
@@ -77,7 +77,7 @@ class ComparisonFile(Section):
     calibrators: dict[str, Block] = Field(
         min_length=1,
         description="A block `calibration` for each calibrator by a label, or the calibrator's name alone. It takes "
-        "the place of the experiment's own.",
+        "the place of the experiment's own, but for what that assumes (`calibration.assumed`).",
     )
     worlds: dict[str, dict[str, Any]] = Field(
         {"ideal": {}},
@@ -426,8 +426,15 @@ def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
 
 def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return an experiment with its defaults and absolute paths, so that it does not depend on its folder."""
-    content = validate(base, folder).model_dump(mode="json")
-    return {key: value for key, value in content.items() if key not in NOT_SHARED}
+    return _shared(validate(base, folder).model_dump(mode="json"))
+
+
+def _shared(experiment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what all cases take from the experiment; what it assumes is part of the world, not of a calibrator."""
+    shared = {key: value for key, value in experiment.items() if key not in NOT_SHARED}
+    calibration = experiment.get("calibration")
+    assumed = calibration.get("assumed") if isinstance(calibration, Mapping) else None
+    return {**shared, "calibration": {"assumed": assumed}} if assumed else shared
 
 
 def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dict[str, Any], Path]:
@@ -444,8 +451,7 @@ def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dic
     if (kind := kind_of(base, folder)).model is not Experiment:
         raise ExperimentError([f"experiment: has the key {kind.key or KINDS.tag!r}, and is no single experiment"])
     has_it = scale in (base.get("scales") or {})
-    base = apply_scale(base, scale if has_it or not optional else None)
-    base = {key: value for key, value in base.items() if key not in NOT_SHARED}
+    base = _shared(apply_scale(base, scale if has_it or not optional else None))
     for dotted, value in content.overrides.items():
         base = override(base, dotted, value)
     return base, folder
