@@ -398,7 +398,7 @@ def load_worlds(
         "name": experiment.name,
         "description": experiment.description,
         "experiment": plain,
-        "calibrators": {label: {"assumed": own["assumed"], **_block(block)} for label, block in blocks.items()},
+        "calibrators": dict(blocks),
         "worlds": {experiment.name[:LONGEST_LABEL]: {}},
     }
     return Comparison.load(StudyFile(file.path, content))
