@@ -15,7 +15,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from hera_pspec import PSpecData, UVPSpec
@@ -46,7 +46,8 @@ class DiagonalPSpecData(PSpecData):
         super().clear_cache(keys)
         self._by_flags: dict[tuple, np.ndarray] = {}
         self._weights: dict[tuple, np.ndarray] = {}
-        self._normalized: tuple | None = None
+        self._spectra: dict[tuple, np.ndarray] = {}
+        self._latest: dict[str, tuple] = {}
 
     def validate_pol(self, dsets: tuple[int, int], pol_pair: tuple[int, int]) -> bool:
         """Check that both data sets have these polarizations, given as integers.
@@ -89,9 +90,22 @@ class DiagonalPSpecData(PSpecData):
         """Return the diagonal normalization M and the window functions W, (Ndlys, Ndlys) each, once per G and H."""
         if mode != "I":
             raise NotImplementedError(f"norm {mode!r} is not diagonal, allowed: 'I'")
-        if self._normalized is None or self._normalized[0] is not G or self._normalized[1] is not H:
-            self._normalized = (G, H, *super().get_MW(G, H, mode=mode, **kwargs))
-        return self._normalized[2:]
+        normalize = super().get_MW
+        return self._once("normalization", G, H, lambda: normalize(G, H, mode=mode, **kwargs))
+
+    def scalar_delay_adjustment(
+        self,
+        key1: tuple = (),
+        key2: tuple = (),
+        sampling: bool = False,
+        Gv: np.ndarray | None = None,
+        Hv: np.ndarray | None = None,
+    ) -> float:
+        """Return the factor that makes the normalization that of the band with its taper, once per G and H."""
+        G = self.get_G(key1, key2) if Gv is None else Gv
+        H = self.get_H(key1, key2, sampling) if Hv is None else Hv
+        adjust = super().scalar_delay_adjustment
+        return self._once(f"adjustment, {self.taper}", G, H, lambda: adjust(key1, key2, sampling, G, H))
 
     def p_hat(self, M: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the normalized band powers M q, shape (Ndlys, Ntimes), complex."""
@@ -106,13 +120,23 @@ class DiagonalPSpecData(PSpecData):
         return 0.5 * first.conj() * second
 
     def _delay_spectrum(self, key: tuple) -> np.ndarray:
-        weighting = self.R(key).diagonal()
-        return np.fft.fftshift(np.fft.fft(weighting[:, None] * self.x(key), axis=0), axes=0)
+        shared_key = (key, self.taper, self.symmetric_taper)
+        if shared_key not in self._spectra:
+            weighted = self.R(key).diagonal()[:, None] * self.x(key)
+            self._spectra[shared_key] = np.fft.fftshift(np.fft.fft(weighted, axis=0), axes=0)
+        return self._spectra[shared_key]
 
     def _flag_weights(self, key: tuple) -> np.ndarray:
         if key not in self._weights:
             self._weights[key] = self.w(key).max(axis=1)
         return self._weights[key]
+
+    def _once(self, name: str, G: np.ndarray, H: np.ndarray, build: Callable[[], Any]) -> Any:
+        """Return what `build` makes of G and H, made again only if these are other arrays than at the last call."""
+        latest = self._latest.get(name)
+        if latest is None or latest[0] is not G or latest[1] is not H:
+            latest = self._latest[name] = (G, H, build())
+        return latest[2]
 
     def _shared(self, key: tuple, build: Callable[[], np.ndarray]) -> np.ndarray:
         if key not in self._by_flags:
@@ -291,6 +315,8 @@ def _to_millikelvin(uvd: UVData, angles: dict[int, tuple[np.ndarray, np.ndarray]
         factor = 1e3 * kelvin_per_jansky(uvd.freq_array, angles[int(pol)][0], uvd.pol_convention)
         converted.data_array[..., index] *= factor
     converted.vis_units = "mK"
+    # For each baseline of a rectangular data set pyuvdata lists those of all.
+    converted.blts_are_rectangular = False
     return converted
 
 

@@ -171,7 +171,7 @@ class Power(Task, stage="power", version=4):
         size, blocks = size_of(self), blocks_in([self.even, self.odd, *behind])
         # Each block has a file of the estimator; spectra and each unit's shares of its antennas are of all blocks.
         spectra = size.baselines * size.channels.count
-        seconds = 2 + 1e-5 * spectra + (blocks - 1) * (0.9 + 0.005 * size.baselines)
+        seconds = 2 + 4e-6 * spectra + (blocks - 1) * (0.9 + 0.002 * size.baselines)
         return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
 
 
