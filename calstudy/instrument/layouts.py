@@ -228,18 +228,27 @@ def make_array(settings: InstrumentSettings) -> Layout:
 def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:
     """Sort baseline vectors, (Nbls, 3), m, into groups that agree to a tolerance in m.
 
-    A baseline and its reverse are in the same group.
+    A baseline and its reverse are in the same group. The arrays of the result cannot be changed.
     """
+    return _redundant_groups(np.asarray(vectors, dtype=float).tobytes(), tolerance)
+
+
+# All members of a comparison, and all passes of a calibration, have the same baselines.
+@lru_cache(maxsize=32)
+def _redundant_groups(content: bytes, tolerance: float) -> RedundantGroups:
     from pyuvdata.utils import redundancy
 
+    vectors = np.frombuffer(content).reshape(-1, 3)
     groups, _, _, _ = redundancy.get_baseline_redundancies(
-        np.arange(len(vectors)), np.asarray(vectors, dtype=float), tol=tolerance, include_conjugates=True
+        np.arange(len(vectors)), vectors, tol=tolerance, include_conjugates=True
     )
     index = np.empty(len(vectors), dtype=int)
     conjugated = np.zeros(len(vectors), dtype=bool)
     for number, members in enumerate(sorted((np.sort(group) for group in groups), key=lambda group: group[0])):
         index[members] = number
         conjugated[members] = vectors[members] @ vectors[members[0]] < 0
+    for values in (index, conjugated):
+        values.flags.writeable = False
     return RedundantGroups(index, conjugated)
 
 

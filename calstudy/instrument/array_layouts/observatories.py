@@ -11,7 +11,8 @@ south-western antenna, number 0.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -128,6 +129,13 @@ MWA_POSITIONS = PackageFile("pyuvdata", "data/mwa_ant_pos.csv")
 MWA_CONFIGURATIONS = (COMPACT_TILES, MWA_TILES["mwa-extended"], MWA_TILES["mwa-phase1"])
 
 
+@cache
+def _mwa_positions() -> Mapping[str, Sequence[float]]:
+    """Return the position of each tile by its name (ECEF relative to the array centre, m)."""
+    with MWA_POSITIONS.path.open() as table:
+        return {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
+
+
 class MwaLayout(NamedLayout):
     """Tiles of the MWA: Phase II compact (paper §Simulations), Phase II extended, or Phase I (Wayth et al. 2018).
 
@@ -139,8 +147,7 @@ class MwaLayout(NamedLayout):
 
     def make(self) -> Layout:
         """Return the tiles, at positions (ECEF relative to the array centre) of the observatory."""
-        with MWA_POSITIONS.path.open() as table:
-            relative = {row["names"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(table)}
+        relative = _mwa_positions()
         whole = next(tiles for tiles in MWA_CONFIGURATIONS if set(tiles) >= set(MWA_TILES[self.kind]))
         tiles = MWA_TILES[self.kind][: self.count]
         place = SITES["mwa"]
