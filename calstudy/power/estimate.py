@@ -44,9 +44,8 @@ class DiagonalPSpecData(PSpecData):
     def clear_cache(self, keys: list | None = None) -> None:
         """Delete all matrices."""
         super().clear_cache(keys)
-        self._by_flags: dict[tuple, np.ndarray] = {}
+        self._made: dict[tuple, np.ndarray] = {}
         self._weights: dict[tuple, np.ndarray] = {}
-        self._spectra: dict[tuple, np.ndarray] = {}
         self._latest: dict[str, tuple] = {}
 
     def validate_pol(self, dsets: tuple[int, int], pol_pair: tuple[int, int]) -> bool:
@@ -69,10 +68,10 @@ class DiagonalPSpecData(PSpecData):
         """Return the data weighting (Nfreqs, Nfreqs) of a baseline: taper times flag weights."""
         self._require_diagonal()
         shared_key = ("weighting", self.taper, self.symmetric_taper, self._flag_weights(key).tobytes())
-        if shared_key not in self._by_flags:
-            self._by_flags[shared_key] = super().R(key)
+        if shared_key not in self._made:
+            self._made[shared_key] = super().R(key)
             self._R: dict[tuple, np.ndarray] = {}
-        return self._by_flags[shared_key]
+        return self._made[shared_key]
 
     def get_G(self, key1: tuple, key2: tuple, exact_norm: bool = False, pol: bool = False) -> np.ndarray:
         """Return G_ab = tr(R1 Q_a R2 Q_b) / 2, shape (Ndlys, Ndlys), complex."""
@@ -120,11 +119,12 @@ class DiagonalPSpecData(PSpecData):
         return 0.5 * first.conj() * second
 
     def _delay_spectrum(self, key: tuple) -> np.ndarray:
-        shared_key = (key, self.taper, self.symmetric_taper)
-        if shared_key not in self._spectra:
+        def transform() -> np.ndarray:
             weighted = self.R(key).diagonal()[:, None] * self.x(key)
-            self._spectra[shared_key] = np.fft.fftshift(np.fft.fft(weighted, axis=0), axes=0)
-        return self._spectra[shared_key]
+            return np.fft.fftshift(np.fft.fft(weighted, axis=0), axes=0)
+
+        # A baseline of a redundant group is in many pairs.
+        return self._shared(("spectrum", self.taper, self.symmetric_taper, key), transform)
 
     def _flag_weights(self, key: tuple) -> np.ndarray:
         if key not in self._weights:
@@ -139,9 +139,9 @@ class DiagonalPSpecData(PSpecData):
         return latest[2]
 
     def _shared(self, key: tuple, build: Callable[[], np.ndarray]) -> np.ndarray:
-        if key not in self._by_flags:
-            self._by_flags[key] = build()
-        return self._by_flags[key]
+        if key not in self._made:
+            self._made[key] = build()
+        return self._made[key]
 
     def _circulant_response(self, key1: tuple, key2: tuple, damping: np.ndarray, exact_norm: bool) -> np.ndarray:
         """Return sum_ij r1_i r2_j damping_(j-i) exp(-2 pi i (a-b)(j-i) / N) / 2 over channels, for all delays a, b."""

@@ -54,6 +54,24 @@ def test_closed_forms_equal_hera_pspec(observe, white, taper, flagged, n_channel
     np.testing.assert_allclose(ours.window_function_array[0], theirs.window_function_array[0], atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:Casting complex values to real:numpy.exceptions.ComplexWarning:hera_pspec")
+def test_an_estimator_that_is_used_again_keeps_nothing_of_another_taper(observe, white):
+    """Normalization and spectra of baselines are kept for all pairs of one call."""
+    even, odd = two(observe(GOLOMB), white)
+    pairs = [(int(a), int(b)) for a, b in antenna_pairs(even)]
+    adapter = PSpecBeamFromArray({-5: np.full(32, 0.14)}, {-5: np.full(32, 0.07)}, even.freq_array)
+
+    def estimator():
+        return DiagonalPSpecData(dsets=[even.copy(), odd.copy()], beam=adapter)
+
+    def power(found, taper):
+        return found.pspec(pairs, pairs, (0, 1), [(-5, -5)], taper=taper, allow_fft=True, verbose=False).data_array[0]
+
+    used = estimator()
+    for taper in ("blackmanharris", "none", "blackmanharris"):
+        np.testing.assert_allclose(power(used, taper), power(estimator(), taper), rtol=1e-12)
+
+
 def test_other_weightings_are_refused(observe, white):
     even, odd = two(observe(GOLOMB), white)
     estimator = DiagonalPSpecData(dsets=[even, odd])
