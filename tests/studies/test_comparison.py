@@ -185,6 +185,9 @@ def test_faults_name_the_case_and_the_field(tmp_path):
         load_study(comparison_file(tmp_path, worlds={"x: 1 cm": {}, "x: 2 kg": {}}))
     with pytest.raises(InputError, match="--scale large"):
         load_study(comparison_file(tmp_path), "large")
+    inline = {**small(tmp_path), "calibration": {"weights": "autos", "assumed": {"sky.foregrounds.count": 9}}}
+    with pytest.raises(ExperimentError, match=r"experiment\.calibration\.weights: .*set calibration.weights in overr"):
+        load_study(comparison_file(tmp_path, experiment=inline))
 
 
 def test_an_array_that_cannot_be_made_is_not_a_refusal_of_calibrators(tmp_path):

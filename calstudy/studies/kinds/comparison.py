@@ -397,7 +397,7 @@ def load_worlds(
     content = {
         "name": experiment.name,
         "description": experiment.description,
-        "experiment": plain,
+        "experiment": _shared(plain),
         "calibrators": dict(blocks),
         "worlds": {experiment.name[:LONGEST_LABEL]: {}},
     }
@@ -437,6 +437,18 @@ def _shared(experiment: Mapping[str, Any]) -> dict[str, Any]:
     return {**shared, "calibration": {"assumed": assumed}} if assumed else shared
 
 
+def _require_effect(calibration: Any) -> None:
+    """Raise ExperimentError if an experiment in the comparison's own file has settings that no case would have."""
+    if isinstance(calibration, Mapping) and (lost := [field for field in calibration if field != "assumed"]):
+        raise ExperimentError(
+            [
+                f"experiment.calibration.{field}: has no effect, as each calibrator has its own block; for all of "
+                f"them, set calibration.{field} in overrides"
+                for field in lost
+            ]
+        )
+
+
 def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dict[str, Any], Path]:
     """Return the experiment from which all cases are made, and the folder of its relative paths.
 
@@ -445,6 +457,7 @@ def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dic
     scale, folder = file.scale, file.folder
     if isinstance(content.experiment, dict):
         base: dict[str, Any] = content.experiment
+        _require_effect(base.get("calibration"))
     else:
         source = folder / content.experiment.expanduser()
         base, folder = read_mapping(source), source.resolve().parent
