@@ -87,7 +87,7 @@ class GainTable:
     def uvcal(self, template: UVData | UVCal) -> UVCal:
         """Return the gains as UVCal, with telescope, channels and times of data, or of gains for them, where needed.
 
-        Raises InputError if antennas, channels or solutions in time cannot be told.
+        Raises InputError if antennas, channels or solutions in time are not known.
         """
         from pyuvdata import UVCal
 
@@ -120,7 +120,7 @@ class GainTable:
         )
 
     def _numbers(self, telescope: Telescope) -> np.ndarray:
-        """Return the number of each antenna; raises InputError if they cannot be told."""
+        """Return the number of each antenna; raises InputError if they are not in the file."""
         if self.antennas is None:
             numbers = np.sort(telescope.antenna_numbers)
             if len(numbers) != len(self.gains):

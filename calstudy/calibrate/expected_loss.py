@@ -262,7 +262,7 @@ class GainResponse:
         return pairs.to_complex(eta)
 
     def left_of(self, difference: np.ndarray) -> np.ndarray:
-        """Return what a fit of gains and foregrounds leaves of a difference of calibrated data, times D.
+        """Return the rest of a difference of calibrated data after a fit of gains and foregrounds, times D.
 
         Both are complex, (Nbls, Nfreqs).
         """

@@ -273,7 +273,7 @@ class ErrorsInTime:
         return found
 
     def _known(self, problem: CalibrationProblem, time: float) -> Absorption | None:
-        """Return what foregrounds absorb, if it was computed for the same samples and prior, within a fringe."""
+        """Return the last absorption if it is of the same samples and prior, and within a fringe; else None."""
         last = self._last
         if last is None or not 0 <= time - last.time < self._fringe or problem.structure != last.structure:
             return None

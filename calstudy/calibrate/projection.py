@@ -348,7 +348,7 @@ class Projector:
         return self._over_stretches(of_stretch, difference, projection)
 
     def left_of(self, difference: tf.Tensor, eta: tf.Tensor, projection: Projection) -> tuple[tf.Tensor, ...]:
-        """Return what remains of a difference of the data after gains change by eta and foregrounds respond, times D.
+        """Return the rest of a difference of the data after gains change by eta and foregrounds respond, times D.
 
         The difference is (2, Nbls, Nfreqs), in the unit of the foregrounds. Results are those of consecutive stretches.
         """

@@ -102,7 +102,7 @@ def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
 
 
 def _block(text: str, kind: str, suffixes: tuple[str, ...]) -> str:
-    """Return what is a file here as a block of a kind or, if it is Python code, by its absolute path."""
+    """Return the name of a file as a block of a kind or, if it is Python code, by its absolute path."""
     if text.lower().endswith(suffixes):
         return json.dumps({"kind": kind, "path": str(Path(text).resolve())})
     is_code = text.endswith(".py") or ".py:" in text

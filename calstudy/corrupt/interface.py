@@ -118,7 +118,7 @@ class GainEffect(Effect):
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, complex, shape (Nants, Nfreqs, 1 or Ntimes, Npols), without the drift.
 
-        A single time stands for all. Antennas are in the order of ``observation.numbers``, to which
+        A single time applies to all. Antennas are in the order of ``observation.numbers``, to which
         ``observation.antennas`` of the baselines refer.
         """
 

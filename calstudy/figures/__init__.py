@@ -152,7 +152,7 @@ class StudyFigure(Plugin):
         return {"spectra": spectra(graph)} if self.needs_products else {}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
-        """Return what else the figure needs of a run, or of one member: by default its `sections`, by their names."""
+        """Collect further inputs from a run, or one member: by default the `sections`, by their names."""
         return {path.rpartition(".")[2]: attrgetter(path)(graph.experiment) for path in self.sections}
 
     @abstractmethod

@@ -81,7 +81,7 @@ def draw_spherical(
     Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
     or two columns, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone (Fig.
     SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³; the lower row ends at `zoom_k`, h/Mpc. Published limits are drawn
-    above only; `z` is the redshift of the spectra, which stands beside theirs. Raise ValueError for another number of
+    above only; `z` is the redshift of the spectra, which is shown beside theirs. Raise ValueError for another number of
     columns, a spectrum without any power, or a power without an error bar.
     """
     if len(columns) not in (1, 2):

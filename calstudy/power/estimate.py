@@ -132,7 +132,7 @@ class DiagonalPSpecData(PSpecData):
         return self._weights[key]
 
     def _once(self, name: str, G: np.ndarray, H: np.ndarray, build: Callable[[], Any]) -> Any:
-        """Return what `build` makes of G and H, made again only if these are other arrays than at the last call."""
+        """Return the result of `build`, computed again only if G or H is another array than at the last call."""
         latest = self._latest.get(name)
         if latest is None or latest[0] is not G or latest[1] is not H:
             latest = self._latest[name] = (G, H, build())

@@ -129,7 +129,7 @@ class _Solution:
         return np.linalg.norm(self.vectors, axis=1)
 
     def axes(self, modes: DelayModes) -> dict[str, Any]:
-        """Return what `modes_of` needs beside amplitudes: delays, lengths and the centre of the band."""
+        """Return the inputs of `modes_of` beside amplitudes: delays, lengths and the centre of the band."""
         return {"delay": modes.delay, "lengths": self.lengths, "centre": self.frequency.mean()}
 
 

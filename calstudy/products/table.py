@@ -54,7 +54,7 @@ class StudyTable(Plugin):
         return {}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
-        """Return what else the table needs of the study."""
+        """Collect further inputs of the table from the study."""
         del graph
         return {}
 

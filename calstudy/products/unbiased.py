@@ -40,7 +40,7 @@ REDUNDANT = 1.0
 
 
 def why_not(experiment: Experiment) -> str | None:
-    """Return what an experiment lacks for a spectrum without its loss, to follow "needs", or None."""
+    """Name what an experiment lacks for a spectrum without its loss, to follow "needs"; None if nothing."""
     pairs = None if experiment.power.pairs == "same-baseline" else "power.pairs: same-baseline"
     return why_no_response(experiment) or pairs
 

@@ -98,7 +98,7 @@ def redshifts_of(band: tuple[float, float]) -> np.ndarray:
 
 
 def read_box(path: Path) -> Box:
-    """Return what a file of 21cmFAST holds, without its cells; raises InputError if it has no brightness."""
+    """Read the content of a file of 21cmFAST, without its cells; raises InputError if it has no brightness."""
     status = path.stat()
     return _read(path, status.st_mtime_ns, status.st_size)
 

@@ -169,7 +169,7 @@ def standings(
     refusals: Sequence[tuple[str, str, str]] = (),
     limit: float = LIMIT,
 ) -> list[InBand]:
-    """Return how every calibrator stands in every band of k, band by band.
+    """Return the verdict on every calibrator in every band of k, band by band.
 
     Parameters
     ----------

@@ -294,7 +294,7 @@ class ReducedKernels:
     def _left_of(
         self, equations: NormalEquations, difference: tf.Tensor, tolerance: float, iterations: int
     ) -> tuple[tf.Tensor, ...]:
-        """Return what a fit with foregrounds leaves of a difference of the data, times D (`Projector.left_of`)."""
+        """Return the rest of a difference of the data after a fit with foregrounds, times D (`Projector.left_of`)."""
         if isinstance(self.projector, FrozenForegrounds):
             raise TypeError("known foregrounds have no prior")
         projection = equations.projection

@@ -430,7 +430,7 @@ def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _shared(experiment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what all cases take from the experiment; what it assumes is part of the world, not of a calibrator."""
+    """Return the keys that all cases have; what is assumed is part of the world, not of a calibrator."""
     shared = {key: value for key, value in experiment.items() if key not in NOT_SHARED}
     calibration = experiment.get("calibration")
     assumed = calibration.get("assumed") if isinstance(calibration, Mapping) else None
