@@ -123,7 +123,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    version: ClassVar[int] = 3
+    # Fits whose preconditioner is singular in single precision converge since 4.
+    version: ClassVar[int] = 4
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -136,7 +137,8 @@ class Unified(_LeastSquares, ForegroundFit):
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
-    version: ClassVar[int] = 3
+    # Fits whose preconditioner is singular in single precision converge since 4.
+    version: ClassVar[int] = 4
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -148,7 +150,8 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
     """Gains are fitted with a sky model whose errors fill the modelled delays; the data tell their size."""
 
     # Only the last solve has the full tolerance since 2.
-    version: ClassVar[int] = 2
+    # Fits whose preconditioner is singular in single precision converge since 3.
+    version: ClassVar[int] = 3
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"

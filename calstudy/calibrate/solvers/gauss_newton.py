@@ -36,6 +36,7 @@ from calstudy.calibrate.records import Solve
 from calstudy.calibrate.solvers.interface import WarmStart
 from calstudy.calibrate.solvers.preconditioners import AntennaBlocks, CoupledBlocks, Inverse
 from calstudy.calibrate.solvers.reduced import (
+    MOST_DAMPING,
     ROUNDING_LOSS,
     ROUNDING_LOSS_IN_DOUBLE,
     ReducedKernels,
@@ -64,11 +65,12 @@ CG_REFRESH = 15
 
 
 class AntennaPreconditioner(NamedTuple):
-    """The channel blocks of each antenna, or coupled blocks, and their inverse at one damping."""
+    """The channel blocks of each antenna, or coupled blocks, and their inverse at one damping, at least `least`."""
 
     blocks: AntennaBlocks | CoupledBlocks
     damping: float
     inverse: Inverse
+    least: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,20 +331,25 @@ class GaussNewton:
         early = state.channel_steps > 0 and kernels.space.vectors is None
         if kernels.by_channel or (preconditioner is None and early):
             return state
-        damping = max(state.damping, kernels.dampings.preconditioner)
+        least = kernels.dampings.preconditioner if preconditioner is None else preconditioner.least
+        damping = max(state.damping, least)
         if preconditioner is None or preconditioner.damping != damping:
             blocks = kernels.blocks(state.projection) if preconditioner is None else preconditioner.blocks
             inverse = kernels.inverse(blocks, kernels.scalar(damping), state.gains)
-            preconditioner = AntennaPreconditioner(blocks, damping, inverse)
+            preconditioner = AntennaPreconditioner(blocks, damping, inverse, least)
         state = replace(state, preconditioner=preconditioner)
+        if state.boost > 1 and (state.curved or math.isfinite(state.predicted)):
+            return state
+        # A boosted damping would shrink the prediction without bringing the minimum any closer.
+        due = max(state.damping / state.boost, least)
         inverse = preconditioner.inverse
-        if state.boost > 1:
-            if state.curved or math.isfinite(state.predicted):
-                return state
-            # A boosted damping would shrink the prediction without bringing the minimum any closer.
-            due = max(state.damping / state.boost, kernels.dampings.preconditioner)
+        if due != damping:
             inverse = kernels.inverse(preconditioner.blocks, kernels.scalar(due), state.gains)
-        return replace(state, predicted=float(kernels.predicted_decrease(state.projection, state.gains, inverse)))
+        predicted = float(kernels.predicted_decrease(state.projection, state.gains, inverse))
+        if math.isfinite(predicted) or least > MOST_DAMPING:
+            return replace(state, predicted=predicted)
+        # Rounding has made blocks singular. Without a prediction the fit would go on to its largest number of steps.
+        return self._prepared(replace(state, preconditioner=preconditioner._replace(least=10 * least)))
 
 
 class _Step(NamedTuple):
