@@ -61,7 +61,7 @@ def named_as_options(renamed: Callable[[str], str]) -> Iterator[None]:
 REMOVED = {
     "examples": "calstudy init --list",
     "schema": "calstudy fields --schema FILE",
-    "check": "a study with these figures: calstudy run checks",
+    "check": "calstudy run checks, whose figures are the checks",
     "bench": "the benchmarks of the repository (benchmarks/README.md)",
 }
 """Commands of earlier versions, and what has taken their place."""
