@@ -74,7 +74,10 @@ class Chokshi2024(Paper):
         "variances as weights or gains that are smooth in frequency",
         "all_beams": "the same with the dipoles in calibration.assumed",
     }
-    usual_members: ClassVar[Mapping[str, str]] = {"one_beam": "deformed-beams", "all_beams": "deformed-beams-known"}
+    usual_members: ClassVar[Mapping[str, str]] = {
+        "one_beam": "long-deformed-beams",
+        "all_beams": "long-deformed-beams-known",
+    }
 
     def statements(self) -> Sequence[Statement]:
         """Return the statements."""

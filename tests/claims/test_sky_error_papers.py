@@ -127,8 +127,8 @@ def test_every_statement_has_the_runs_that_it_needs(members):
         ("byrne2019", "redundant_complete", "sky-based", "'sky-based', not 'redcal'"),
         ("byrne2023", "delay_weighted", "sky-based-incomplete", "not 'delay-weighted'"),
         ("joseph2020", "dead_dipoles", "sky-based", "dead_tiles is 0"),
-        ("chokshi2024", "one_beam", "deformed-beams-known", "calibration.assumed has instrument.as_built"),
-        ("chokshi2024", "all_beams", "deformed-beams", "does not have the true instrument"),
+        ("chokshi2024", "one_beam", "long-deformed-beams-known", "calibration.assumed has instrument.as_built"),
+        ("chokshi2024", "all_beams", "long-deformed-beams", "does not have the true instrument"),
         ("chokshi2024", "one_beam", "long-dead-dipoles", "amplitude_scatter is 0"),
     ],
 )
@@ -163,9 +163,15 @@ def test_another_run_is_refused(members, name, role, member, reason):
             "instrument.as_built.positions.scatter=2 cm",
             "positions.scatter",
         ),
-        ("chokshi2024", "one_beam", "deformed-beams", "instrument.as_built.dipoles.dead_tiles=0.3", "dead_tiles"),
-        ("chokshi2024", "one_beam", "deformed-beams", "instrument.as_built.dipoles.amplitude_scatter=1 %", "0.01, not"),
-        ("chokshi2024", "all_beams", "deformed-beams-known", "corruption.effects=[{kind: rfi}]", "rfi"),
+        ("chokshi2024", "one_beam", "long-deformed-beams", "instrument.as_built.dipoles.dead_tiles=0.3", "dead_tiles"),
+        (
+            "chokshi2024",
+            "one_beam",
+            "long-deformed-beams",
+            "instrument.as_built.dipoles.amplitude_scatter=1 %",
+            "0.01, not",
+        ),
+        ("chokshi2024", "all_beams", "long-deformed-beams-known", "corruption.effects=[{kind: rfi}]", "rfi"),
     ],
 )
 def test_a_run_with_another_fault_is_refused(members, name, role, member, fault, reason):
@@ -217,7 +223,7 @@ def test_weights_are_inverse_variances_or_gains_are_smooth(members, weights, gai
         ("byrne2023", "sky_based", "long-sky-based-incomplete"),
         ("byrne2023", "delay_weighted", "long-delay-weighted-incomplete"),
         ("joseph2020", "dead_dipoles", "long-dead-dipoles"),
-        ("chokshi2024", "one_beam", "deformed-beams"),
+        ("chokshi2024", "one_beam", "long-deformed-beams"),
     ):
         changed = with_fault(with_fault(members[member], setting), f"corruption.effects=[{gains}]")
         refusal = paper(name).refusal(role, changed)
