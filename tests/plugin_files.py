@@ -20,6 +20,7 @@ from calstudy.run.task import Task, unique
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = "\n".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("extending*.md")))
+BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 
 
 def example(title: str) -> tuple[str, str, dict[str, Any]]:
@@ -79,3 +80,13 @@ def make(tasks: Iterable[Task], folder: Path) -> dict[str, Product]:
     store = Store(folder / "store")
     store.root.mkdir(exist_ok=True)
     return {task.key: perform(loads(dumps(WorkOrder.of(task, store)))) for task in unique(tasks)}
+
+
+def sections() -> dict[str, dict[str, str]]:
+    """Return the blocks of each section that has some, by the section's title and the language of the block."""
+    found = {}
+    for text in re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]:
+        blocks = {match["language"]: match["text"] for match in BLOCK.finditer(text)}
+        if blocks:
+            found[text.splitlines()[0]] = blocks
+    return found

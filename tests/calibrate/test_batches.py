@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_calibration_loss import redundant_structure
-from test_foreground_prior import prior_structure
 from toy import HEX, complex_normal, make_toy
+from toy_structures import prior_structure, redundant_structure
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs, tensors

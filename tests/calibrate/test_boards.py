@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hera_cal.skycal import estimate_SNAP_decoherence
-from test_calamity import make_uvdata
-from test_hera_cal_calibrators import sky_of
 from toy import FREQUENCIES, Toy, make_toy, scattered
+from toy_data import make_uvdata, sky_of
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation

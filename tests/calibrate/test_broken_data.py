@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import run_and_read, run_command, time_limit
 from pyuvdata import UVData
-from test_calamity import make_uvdata
+from toy_data import make_uvdata
 
 REFUSED, UNCONVERGED = 2, 3
 OPTIONS = ["--buffer", "50 ns", "--set", "basis.min_delay=50 ns", "--overwrite"]

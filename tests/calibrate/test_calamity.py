@@ -6,60 +6,15 @@ import json
 
 import numpy as np
 import pytest
-from astropy.coordinates import EarthLocation
-from pyuvdata import Telescope, UVData
-from pyuvdata.utils import ECEF_from_ENU, uvcalibrate
-from toy import FREQUENCIES, HEX, make_toy, scattered
+from pyuvdata.utils import uvcalibrate
+from toy import HEX, make_toy, scattered
+from toy_data import ONE_SOLVE, SETTINGS, make_uvdata
 
 from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
 from calstudy.calibrate.calibrators.least_squares import Calamity, CalamityRedundant, SkyBased
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import gain_products
-from calstudy.calibrate.settings import AdamaxSettings, BasisSettings, FlagWeights, GaussNewtonSettings
-
-SETTINGS = Calamity(basis=BasisSettings(min_delay="50 ns", buffer="50 ns"))
-# Weights that need no second pass.
-ONE_SOLVE = SETTINGS.model_copy(update={"weights": FlagWeights()})
-SITE = EarthLocation.from_geodetic(116.67, -26.7, 377.8)
-
-
-def make_uvdata(toy, n_times=3, polarizations=(-5,), skip=2):
-    """Wrap a toy as UVData with antenna numbers that are not their indices; times differ by a little noise."""
-    numbers = 10 + 2 * np.arange(len(toy.positions))
-    ecef = ECEF_from_ENU(toy.positions, center_loc=SITE) - np.array([axis.to_value("m") for axis in SITE.geocentric])
-    telescope = Telescope.new(
-        name="toy",
-        location=SITE,
-        antenna_positions=ecef,
-        antenna_numbers=numbers,
-        antenna_names=[f"ant{number}" for number in numbers],
-        instrument="toy",
-        feed_array=["x", "y"],
-        feed_angle=[np.pi / 2, 0.0],
-        mount_type="fixed",
-        update_from_known=False,
-    )
-    uvd = UVData.new(
-        freq_array=FREQUENCIES,
-        polarization_array=np.array(polarizations),
-        times=2459000.5 + np.arange(n_times) * 2 / 86400,
-        antpairs=numbers[toy.antennas],
-        do_blt_outer=True,
-        time_axis_faster_than_bls=False,
-        integration_time=2.0,
-        channel_width=float(np.diff(FREQUENCIES)[0]),
-        telescope=telescope,
-        vis_units="Jy",
-        pol_convention="sum",
-        update_telescope_from_known=False,
-    )
-    rng = np.random.default_rng(12)
-    cube = np.repeat(toy.visibilities[None, :, :, None], n_times, 0).repeat(len(polarizations), 3)
-    cube = cube * (1 + 1e-4 * rng.standard_normal((n_times, 1, 1, len(polarizations))))
-    uvd = from_cube(uvd, cube)
-    uvd.flag_array[:] = False
-    uvd.nsample_array[:] = 1
-    return uvd
+from calstudy.calibrate.settings import AdamaxSettings, FlagWeights, GaussNewtonSettings
 
 
 def products(result, polarization=0):

@@ -13,7 +13,7 @@ from contextlib import redirect_stderr, redirect_stdout
 import numpy as np
 import pytest
 from pyuvdata import UVCal, UVData
-from test_calamity import make_uvdata
+from toy_data import make_uvdata
 
 import calstudy
 from calstudy.base.errors import InputError

@@ -5,36 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from toy import HEX, complex_normal, make_toy
+from toy_structures import redundant_structure
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
-from calstudy.calibrate.basis import make_basis
-from calstudy.calibrate.problem import FitStructure, flag_weights, gain_products
+from calstudy.calibrate.problem import flag_weights, gain_products
 from calstudy.calibrate.projection import Projector
 from calstudy.calibrate.solvers import adamax
 from calstudy.calibrate.solvers.adamax import FitData, Parameters
 from calstudy.calibrate.tensors import FitTensors
-from calstudy.instrument.layouts import redundant_groups
 
 TOLERANCE = {"single": 1e-6, "double": 1e-12}
-
-
-def redundant_structure(toy):
-    # Turning some baselines around makes conjugated members, which a list with a < b on a hexagon may lack.
-    antennas = np.where(np.arange(len(toy.antennas))[:, None] % 2, toy.antennas[:, ::-1], toy.antennas)
-    vectors = toy.positions[antennas[:, 1]] - toy.positions[antennas[:, 0]]
-    groups = redundant_groups(vectors, 0.1)
-    lengths = [np.linalg.norm(vectors[groups.index == group], axis=1).max() for group in range(groups.index.max() + 1)]
-    basis = make_basis(np.array(lengths), *basis_arguments())
-    assert groups.conjugated.any()
-    assert basis.n_models < len(antennas)
-    return FitStructure(antennas, len(toy.positions), basis, groups.index, groups.conjugated)
-
-
-def basis_arguments():
-    from toy import BASIS, FREQUENCIES
-
-    return FREQUENCIES, BASIS
 
 
 @pytest.fixture(params=["per-baseline", "redundant", "autos"])

@@ -7,8 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from test_calamity import SETTINGS, make_uvdata
-from test_hera_cal_calibrators import sky_of
+from toy_data import SETTINGS, make_uvdata, sky_of
 
 from calstudy.base.resources import Usage
 from calstudy.calibrate.calibrators.other_packages import Skycal

@@ -5,9 +5,8 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from test_calamity import make_uvdata
-from test_hera_cal_calibrators import errors, sky_of, statuses, turned
-from toy import make_toy, scattered
+from toy import make_toy, scattered, turned
+from toy_data import errors, make_uvdata, sky_of, statuses
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import to_cube

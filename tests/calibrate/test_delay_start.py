@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.constants import speed_of_light
-from test_calamity import ONE_SOLVE, make_uvdata
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
+from toy_data import ONE_SOLVE, make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scipy.linalg import solve_triangular
-from test_calamity import make_uvdata
-from test_foreground_prior import dense_covariance, free_structure, prior_structure, turned
 from toy import HEX, complex_normal, make_toy, scattered
+from toy_data import make_uvdata
+from toy_structures import dense_covariance, free_structure, prior_structure, turned
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import from_cube

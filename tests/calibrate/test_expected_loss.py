@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_calibration_loss import redundant_structure
-from test_foreground_prior import dense_covariance, prior_structure, turned
 from toy import FREQUENCIES, HEX, complex_normal, make_toy, scattered
+from toy_structures import dense_covariance, prior_structure, redundant_structure, turned
 
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.expected_loss import DelayModes, expected_transfer, linear_response

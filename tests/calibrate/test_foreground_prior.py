@@ -9,9 +9,9 @@ import pytest
 from hera_cal.datacontainer import DataContainer
 from hera_cal.redcal import RedundantCalibrator
 from hera_cal.skycal import refine_gains
-from test_calamity import make_uvdata
-from test_calibration_loss import redundant_structure
 from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
+from toy_data import make_uvdata
+from toy_structures import OWN, SHARED, dense_covariance, free_structure, prior_structure, redundant_structure, turned
 
 from calstudy.base.tensorflow import tf
 from calstudy.base.visibilities import from_cube, to_cube
@@ -29,19 +29,6 @@ from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.realdata.settings import defaults
 
 SIGMA = 0.05
-OWN, SHARED = 0.7, 1.9
-
-
-def prior_structure(toy, prior):
-    """The toy's baselines, some of them turned around, by redundant groups unless all coefficients are their own."""
-    structure = redundant_structure(toy)
-    lengths = np.linalg.norm(toy.positions[structure.antennas[:, 1]] - toy.positions[structure.antennas[:, 0]], axis=1)
-    if prior == "own":
-        basis = make_basis(lengths, FREQUENCIES, BASIS, prior=True)
-        return replace(FitStructure.per_baseline(structure.antennas, len(toy.positions), basis), prior=prior)
-    longest = np.zeros(structure.basis.n_models)
-    np.maximum.at(longest, structure.groups, lengths)
-    return replace(structure, basis=make_basis(longest, FREQUENCIES, BASIS, prior=True), prior=prior)
 
 
 @pytest.fixture(params=["own", "shared", "both"])
@@ -55,28 +42,6 @@ def problem(request, hexagon) -> CalibrationProblem:
     data = sky + complex_normal(rng, shape)
     start = np.ones((structure.n_antennas, structure.n_frequencies), complex)
     return CalibrationProblem(structure, data, weights, start, sky, deviations=(OWN, SHARED))
-
-
-def dense_covariance(structure, own=OWN, shared=SHARED):
-    """C of all samples, (Nbls Nfreqs) squared, for visibilities of which conjugated ones are turned back."""
-    vectors = [None] * structure.basis.n_models
-    for bucket in structure.basis.buckets:
-        for index in bucket.members:
-            vectors[index] = bucket.vectors
-    n = structure.n_frequencies
-    result = np.zeros((structure.n_baselines, n, structure.n_baselines, n))
-    for p, group in enumerate(structure.groups):
-        covariance = vectors[group] @ vectors[group].T
-        if structure.prior in ("own", "both"):
-            result[p, :, p] += own**2 * covariance
-        if structure.prior in ("shared", "both"):
-            for q in np.flatnonzero(structure.groups == group):
-                result[p, :, q] += shared**2 * covariance
-    return result.reshape(structure.n_baselines * n, -1)
-
-
-def turned(structure, values):
-    return np.where(structure.conjugated[:, None], values.conj(), values)
 
 
 def dense_fit(problem, gains):
@@ -180,12 +145,6 @@ def spoiled(toy, fraction=0.06):
         coefficients = complex_normal(rng, (bucket.members.size, bucket.vectors.shape[1]))
         error[bucket.members] = coefficients @ bucket.vectors.T
     return toy.foregrounds - fraction * rms * error
-
-
-def free_structure(toy):
-    """The toy's own baselines, each with a prior of its own."""
-    basis = make_basis(np.linalg.norm(toy.vectors, axis=1), FREQUENCIES, BASIS, prior=True)
-    return replace(FitStructure.per_baseline(toy.antennas, len(toy.positions), basis), prior="own")
 
 
 def test_a_vanishing_deviation_is_sky_based_calibration_by_hera_cal(toy):

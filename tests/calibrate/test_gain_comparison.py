@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 from command_line import run_command
-from test_calamity import make_uvdata
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
+from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal

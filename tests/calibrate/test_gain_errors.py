@@ -13,9 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_calibration_loss import redundant_structure
-from test_foreground_prior import turned
 from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
+from toy_structures import redundant_structure, turned
 
 from calstudy.calibrate.basis import gain_vectors, make_basis
 from calstudy.calibrate.degeneracy import fix_degeneracies

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
-from test_calamity import make_uvdata
 from toy import complex_normal, make_toy, scattered
+from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gain_pair, read_gains, write_gains

@@ -11,9 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_calamity import SETTINGS, make_uvdata
-from test_hera_cal_calibrators import LARGE_HEX, sky_of
-from toy import FREQUENCIES, complex_normal, make_toy, point_source_visibilities, scattered
+from toy import FREQUENCIES, LARGE_HEX, complex_normal, make_toy, point_source_visibilities, scattered
+from toy_data import SETTINGS, make_uvdata, sky_of
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import to_cube

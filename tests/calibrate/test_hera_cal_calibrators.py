@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hera_cal.redcal import RedundantCalibrator
-from test_calamity import make_uvdata
-from toy import HEX, complex_normal, make_toy, scattered
+from toy import HEX, LARGE_HEX, complex_normal, make_toy, scattered, turned
+from toy_data import errors, make_uvdata, sky_of, statuses
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
@@ -21,9 +21,6 @@ from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.settings import FlagWeights
 
-LARGE_HEX = 14.0 * np.array(
-    [[x + y / 2, y * np.sqrt(0.75), 0] for y in range(-2, 3) for x in range(-2, 3) if abs(x + y) < 3]
-)
 EXACT = 1e-7
 """Of noiseless fits, which stop when gains change by 1e-8."""
 CASES = {"redcal": (Redcal(), LARGE_HEX), "skycal": (Skycal(), scattered(8))}
@@ -33,34 +30,6 @@ CASES = {"redcal": (Redcal(), LARGE_HEX), "skycal": (Skycal(), scattered(8))}
 def case(request):
     calibrator, positions = CASES[request.param]
     return calibrator, make_toy(positions, noise=0.0)
-
-
-def sky_of(uvd, foregrounds):
-    """A sky model with the samples of the data."""
-    return from_cube(uvd, np.broadcast_to(foregrounds[None, :, :, None], to_cube(uvd).shape))
-
-
-def turned(toy):
-    """The toy with every second baseline reversed."""
-    antennas, foregrounds = toy.antennas.copy(), toy.foregrounds.copy()
-    antennas[::2] = antennas[::2, ::-1]
-    foregrounds[::2] = foregrounds[::2].conj()
-    noise = toy.noise.copy()
-    noise[::2] = noise[::2].conj()
-    return replace(toy, antennas=antennas, foregrounds=foregrounds, noise=noise)
-
-
-def errors(result, toy, integration=0, polarization=0):
-    """Difference of the gains from the truth, phases aligned, NaN where they are flagged, (Nants, Nfreqs)."""
-    rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(toy.positions)))
-    gains = result.gains.gain_array[rows, :, integration, polarization]
-    flags = result.gains.flag_array[rows, :, integration, polarization]
-    aligned = fix_phase(np.where(flags, 0, gains), np.where(flags, 0, toy.gains))
-    return np.where(flags, np.nan, aligned - toy.gains)
-
-
-def statuses(result):
-    return [record.status for record in result.solutions]
 
 
 def test_noiseless_gains_are_exact(case):

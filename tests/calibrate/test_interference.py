@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pyuvdata import UVData
-from test_calamity import make_uvdata
 from toy import make_toy, scattered
+from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_solvers import in_the_span, product_error
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
+from toy_structures import in_the_span, product_error
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_calibration_loss import redundant_structure
 from toy import FREQUENCIES, HEX, complex_normal, make_toy
+from toy_structures import redundant_structure
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from command_line import run_and_read, run_command
 from pyuvdata import UVCal, UVData
-from test_calamity import make_uvdata
 from toy import make_toy, scattered
+from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate.records import CalibrationResult, make_gains, make_visibilities

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pyuvdata import UVData
-from test_calamity import make_uvdata
+from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_calamity import ONE_SOLVE, make_uvdata
 from toy import FREQUENCIES, HEX, make_toy, scattered
+from toy_data import ONE_SOLVE, make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_calamity import make_uvdata
 from tiny import tiny
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
+from toy_data import make_uvdata
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.observation import Observation

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_calibration_loss import redundant_structure
 from toy import complex_normal, make_toy, scattered
+from toy_structures import in_the_span, product_error, redundant_structure
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import calamity
@@ -25,22 +25,6 @@ from calstudy.calibrate.solvers.preconditioners import coupled_inverse
 from calstudy.calibrate.solvers.reduced import compiled
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.array_layouts.geometric import GOLOMB_MARKS
-
-
-def in_the_span(toy):
-    """The foregrounds as the basis can hold them exactly."""
-    foregrounds = toy.foregrounds.copy()
-    for bucket in toy.basis.buckets:
-        foregrounds[bucket.members] = foregrounds[bucket.members] @ bucket.vectors @ bucket.vectors.T
-    return foregrounds
-
-
-def product_error(problem, solution):
-    """Largest difference between g g* F and the data where they are used, relative to the data's rms."""
-    used = problem.weights > 0
-    data = problem.visibilities[used]
-    fitted = (gain_products(solution.gains, problem.structure.antennas) * solution.model)[used]
-    return np.abs(fitted - data).max() / np.sqrt(np.mean(np.abs(data) ** 2))
 
 
 @pytest.fixture(scope="module")

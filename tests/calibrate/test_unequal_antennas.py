@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from test_calamity import make_uvdata
 from toy import make_toy, scattered
+from toy_data import make_uvdata
 
 from calstudy.base.observation import Observation
 from calstudy.calibrate.execution import run_calibrator

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pyuvdata import UVFlag
-from test_calamity import ONE_SOLVE, SETTINGS, make_uvdata
 from toy import make_toy, scattered
+from toy_data import ONE_SOLVE, SETTINGS, make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation

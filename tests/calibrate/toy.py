@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -14,6 +14,9 @@ from calstudy.calibrate.settings import BasisSettings
 FREQUENCIES = 160e6 + 400e3 * np.arange(64)
 BASIS = BasisSettings(min_delay="50 ns", buffer="50 ns")
 HEX = 14.0 * np.array([[x + y / 2, y * np.sqrt(0.75), 0] for y in (-1, 0, 1) for x in range(-1, 2) if abs(x + y) < 2])
+LARGE_HEX = 14.0 * np.array(
+    [[x + y / 2, y * np.sqrt(0.75), 0] for y in range(-2, 3) for x in range(-2, 3) if abs(x + y) < 3]
+)
 
 
 @dataclass(frozen=True)
@@ -82,3 +85,13 @@ def make_toy(positions: np.ndarray, noise: float = 1e-3, seed: int = 1, autos: b
 def scattered(n_antennas: int, seed: int = 3) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-10, 10, (n_antennas, 2)), np.zeros(n_antennas)])
+
+
+def turned(toy):
+    """The toy with every second baseline reversed."""
+    antennas, foregrounds = toy.antennas.copy(), toy.foregrounds.copy()
+    antennas[::2] = antennas[::2, ::-1]
+    foregrounds[::2] = foregrounds[::2].conj()
+    noise = toy.noise.copy()
+    noise[::2] = noise[::2].conj()
+    return replace(toy, antennas=antennas, foregrounds=foregrounds, noise=noise)

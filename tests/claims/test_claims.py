@@ -2,31 +2,21 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from paper_runs import ADAMAX, AUTHORS, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, verdicts
 from tiny import of_the_paper
 
 from calstudy.base.errors import InputError
 from calstudy.claims.bins import RecoveredPower, bias_extent, difference_of_ratios, fraction_within, recovered
 from calstudy.claims.evaluation import evaluate_folder, evaluate_members, evaluate_run, refusals_of_run
-from calstudy.experiment.files import dump, override, validate
-from calstudy.experiment.model import PAPERS
+from calstudy.experiment.files import override, validate
 from calstudy.power.tables import save_spectrum
 from calstudy.studies.load import load_study
 from calstudy.verdicts.tables import from_json
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-PAPER = PAPERS.make("calamity2022")
-LOW_SNR_FACTS = {"corruption": {"effects": [{"kind": "reflection-gains"}], "noise": {"kind": "times-foregrounds"}}}
-AUTHORS = {"name": "adamax", "learning_rate": 0.01, "tolerance": 0.0, "max_steps": 10_000, "keep": "last"}
-ADAMAX = {"calibration": {"solver": AUTHORS}}
 GROUPS = {"calibration": {"calibrator": "calamity-redundant"}}
-
-
-def verdicts(claims) -> dict[str, str]:
-    return {claim.name: claim.verdict for claim in claims}
 
 
 NEVER_SUPPORTED = {
@@ -600,13 +590,6 @@ def test_half_of_the_values_within_their_bars_is_a_half():
     found = fraction_within(np.array([0.0, 1.9, 2.0, -5.0]), np.ones(4))
     assert found.value == 0.5
     assert found.uncertainty == pytest.approx(np.sqrt(0.95 * 0.05 / 4))
-
-
-def run_folder(study, folder: Path) -> Path:
-    """Make the folder of a study's tables that of a finished run."""
-    (folder / "manifest.json").write_text(json.dumps({"name": study.name, "stand_ins": ["a small sky"]}))
-    (folder / "experiment.yaml").write_text(dump(study.experiment))
-    return folder
 
 
 def test_a_run_folder_is_evaluated_and_written(make_study, tmp_path):

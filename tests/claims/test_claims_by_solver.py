@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from test_claims import ADAMAX, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, verdicts
+from paper_runs import ADAMAX, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_folder, verdicts
 
 from calstudy.base.errors import InputError
 from calstudy.claims.evaluation import Claims, evaluate_by_solver, evaluate_folder

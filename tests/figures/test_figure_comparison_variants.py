@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from test_figure_comparison_matrix import case
+from flat_scores import case
 
 from calstudy.figures.comparison import VARIANT_COLOURS, draw_variants, variants
 from calstudy.products.tolerances import upper_limit

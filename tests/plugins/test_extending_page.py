@@ -6,7 +6,7 @@ import re
 
 import pytest
 import yaml
-from plugin_files import TEXT
+from plugin_files import sections
 from tiny import tiny
 
 from calstudy.base.plugins import Registry
@@ -25,18 +25,7 @@ FEWEST_VARIANTS = {
     "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},
     "eor": {"components": ["eor"]},
 }
-BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<text>.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 MOST_LINES = 40
-
-
-def sections() -> dict[str, dict[str, str]]:
-    """Return the blocks of each section that has some, by the section's title and the language of the block."""
-    found = {}
-    for text in re.split(r"^## ", TEXT, flags=re.MULTILINE)[1:]:
-        blocks = {match["language"]: match["text"] for match in BLOCK.finditer(text)}
-        if blocks:
-            found[text.splitlines()[0]] = blocks
-    return found
 
 
 def merged(base: dict | str, changes: dict) -> dict:

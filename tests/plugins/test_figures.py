@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from installed import install
+from plugin_files import sections
 from rich.console import Console
-from test_extending_page import sections
 from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from command_line import run_command
 from installed import install
+from plugin_files import sections
 from rich.console import Console
-from test_extending_page import sections
 from tiny import tiny
 
 from calstudy.base.errors import InputError

@@ -10,7 +10,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from test_report import CLAIM, MANIFEST, PNG
+from report_content import CLAIM, MANIFEST, PNG
 
 from calstudy.report.page import write_report, write_several
 

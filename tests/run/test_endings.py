@@ -16,7 +16,7 @@ import pytest
 import yaml
 from command_line import run_command
 from filelock import FileLock
-from test_perform import Number, run
+from number_task import Number, run
 from tiny import tiny
 
 from calstudy.base.errors import InputError

@@ -5,34 +5,22 @@ import socket
 import subprocess
 import sys
 import traceback
-from dataclasses import field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from number_task import Number, run
 
 from calstudy.base.errors import DiskError, ExperimentError, InputError
 from calstudy.base.resources import Cost
 from calstudy.base.user_code import UserCodeError
 from calstudy.run import execution
-from calstudy.run.execution import Lifetimes, Workers, WorkOrder, execute, largest_disk, perform, schedule
+from calstudy.run.execution import Lifetimes, WorkOrder, largest_disk, perform, schedule
 from calstudy.run.store import Lease, Store, products
-from calstudy.run.task import Inputs, Piece, Task
+from calstudy.run.task import Task
 
 EXIT_INPUT = 2
-
-
-class Number(Task, stage="number"):
-    """A number added to those of other products."""
-
-    number: int
-    needed: Inputs = field(default_factory=dict)
-    piece: Piece = None
-
-    def make(self, output: Path) -> dict:
-        number = self.number + sum(int((folder / "number").read_text()) for folder in self.needs.values())
-        (output / "number").write_text(str(number))
-        return {"number": number}
 
 
 class Newer(Number, stage="number", version=2):
@@ -62,11 +50,6 @@ def store(tmp_path) -> Store:
     found = Store(tmp_path / "store")
     found.prepare()
     return found
-
-
-def run(task: Task, store: Store) -> None:
-    """Make a task and what it needs with one worker, as a run does."""
-    execute(schedule([task], store).todo, store, Workers(1, store.root / "run.log"))
 
 
 def test_a_product_is_made_from_its_inputs_and_pieces_and_recorded(store):

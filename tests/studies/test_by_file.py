@@ -12,7 +12,8 @@ import pytest
 import yaml
 from command_line import run_command
 from pyuvdata import UVCal, UVData
-from test_signal_loss import small
+from score_rows import row
+from small_chain import small
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
@@ -28,7 +29,7 @@ from calstudy.products.score import score
 from calstudy.studies.export import CARRIER
 from calstudy.studies.kinds.comparison import WorldData, load_worlds
 from calstudy.studies.load import load_study
-from calstudy.studies.scores import Row, Scores, leaderboard, read_scores, scoring_of
+from calstudy.studies.scores import Scores, leaderboard, read_scores, scoring_of
 from calstudy.studies.study import Budget, run_study
 
 pytestmark = pytest.mark.chain
@@ -485,24 +486,6 @@ def test_the_leaderboard_has_all_scores_and_these_are_of_the_challenge():
         for item in read_scores(path).rows:
             assert (item.digest, item.scoring) == digests[item.world], f"{path.name}: {item.world}"
             assert f"| {item.calibrator} |" in page
-
-
-def row(world, calibrator, bias, error, transfer, digest="d", scoring="y"):
-    bands = [
-        {"k": k, "transfer": kept, "transfer_error": 0.1, "bias": off, "bias_error": error}
-        for k, kept, off in zip(([0.1, 0.2], [0.2, 0.5]), transfer, bias, strict=True)
-    ]
-    scores = {
-        "bands": bands,
-        "flux_scale": 1.0,
-        "gain_error_aligned": None,
-        "gain_error_as_fitted": None,
-        "held_out_chi_squared": None,
-        "by_status": {"by-file": 1},
-        "cpu_seconds_per_integration": None,
-        "peak_memory": None,
-    }
-    return Row(world=world, calibrator=calibrator, digest=digest, scoring=scoring, scores=scores)
 
 
 def test_a_leaderboard_ranks_by_what_is_unbiased_first_and_then_by_what_is_left(tmp_path):

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import yaml
-from test_signal_loss import small
+from small_chain import small
 
 import calstudy
 from calstudy.base.errors import ExperimentError, InputError

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from observations import small_instrument
-from test_by_file import row
+from score_rows import row
 
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from pyuvdata import UVData
-from test_signal_loss import small
+from small_chain import small
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, to_cube

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from tiny import tiny
+from small_chain import ANTENNAS, VARIANTS, small
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.experiment.files import dump, load, override, validate
+from calstudy.experiment.files import dump, load, validate
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction, TransferMap, pool
 from calstudy.products.signal_loss import transfer
@@ -22,28 +22,6 @@ from calstudy.studies.study import Budget, Run, run_study
 pytestmark = pytest.mark.chain
 
 DRAWN = True
-
-ANTENNAS = 7
-VARIANTS = {
-    "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},
-    "residual_without_eor": {"components": ["foregrounds", "noise"], "effects": True, "calibrate": True},
-    "eor": {"components": ["eor"]},
-}
-
-
-def small(folder, **fields) -> dict:
-    """The tiny chain with an array of few redundant baselines, and only what the signal loss needs."""
-    data = {**tiny(folder), "variants": VARIANTS}
-    data = override(data, "instrument.layout", {"kind": "mwa-compact-minredundant", "count": ANTENNAS})
-    # So few antennas stall in single precision: the second integration would be solved twice, from the first and anew.
-    # What further steps change of T outside the wedge is less than its errors.
-    solver = {"warm_start": False, "max_steps": 20}
-    cheap = {"simulation.chunks": 1, "calibration.chunks": 1, "calibration.solver": solver}
-    for path, value in {"outputs.figures": ["signal-loss"], **cheap}.items():
-        data = override(data, path, value)
-    for path, value in fields.items():
-        data = override(data, path.replace("__", "."), value)
-    return data
 
 
 SWEEP = [
