@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.cli.options import MaxMemory, named_as_options
+from calstudy.cli.options import MaxMemory, Overwrite, named_as_options
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,7 +76,6 @@ GainErrors = Annotated[
     bool, typer.Option(help="Give gains their errors by noise; about a third of the time of the solves.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Read and check everything, say what would be done, and stop.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace results of an earlier calibration.")]
 
 
 def calibrate(

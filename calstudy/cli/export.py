@@ -8,11 +8,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from calstudy.cli.options import AsJson, MaxMemory, Scale, Set, StudyFile, Workers
+from calstudy.cli.options import AsJson, MaxMemory, Overwrite, Scale, Set, StudyFile, Workers
 
 Format = Annotated[str, typer.Option("--format", help="uvh5, uvfits or ms (which takes python-casacore).")]
 Output = Annotated[Path, typer.Option(help="Folder for the data; worlds of a comparison get a folder each in it.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier export.")]
 Blind = Annotated[
     Path | None,
     typer.Option(metavar="RECIPE.yaml", help="Draw secret seeds, write them with the file to a new one, export that."),
@@ -69,7 +68,6 @@ OfClass = Annotated[
 ScoreFile = Annotated[
     Path | None, typer.Option("--output", metavar="FILE.json", help="Write the scores, for a leaderboard.")
 ]
-OverwriteScores = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier file of scores.")]
 
 
 def score(
@@ -83,7 +81,7 @@ def score(
     overrides: Set = None,
     workers: Workers = None,
     max_memory: MaxMemory = None,
-    overwrite: OverwriteScores = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Score gains of another program, found for data of `calstudy export`, as built-in calibrators are scored.
 

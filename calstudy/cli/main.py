@@ -25,7 +25,7 @@ from calstudy.base.package_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate, compare_gains
 from calstudy.cli.checks import regress, validate
 from calstudy.cli.export import export, leaderboard, score
-from calstudy.cli.options import AsJson, MaxMemory, Scale, Scheduler, Sections, Set, StudyFile, Workers
+from calstudy.cli.options import AsJson, MaxMemory, Overwrite, Scale, Scheduler, Sections, Set, StudyFile, Workers
 from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
 from calstudy.cli.which import which
@@ -180,7 +180,7 @@ def report(
     output: Annotated[
         Path | None, typer.Option(help="Page of several runs; by default FOLDER-and-OTHER.html here.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the page of several runs.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the report of a finished run, one self-contained page, report.html, into its folder.
 

@@ -35,6 +35,7 @@ Scheduler = Annotated[
         help="Use a running dask cluster in place of own workers: its address, or the scheduler file that it wrote.",
     ),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that an earlier call wrote.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
 
 SECTIONS = {

@@ -56,9 +56,10 @@ REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Parts of Fourier space; true for the part inside the wedge."""
 SCALE, SUMMARY = "scale.json", "summary.csv"
 NOTE = (
-    "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR. "
-    "The squared coherence of response and EoR is free of the error of the calibration's flux scale; for spectra "
-    "of each baseline with itself it is the fraction of the power that is retained. One standard deviation."
+    "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR, free "
+    "of the error of the calibration's flux scale where the true gains are known. The squared coherence of response "
+    "and EoR does not need these; for spectra of each baseline with itself it is the fraction of the power that is "
+    "retained. One standard deviation."
 )
 
 
@@ -234,11 +235,16 @@ class SweepSummary(Task, stage="sweep-summary", version=1, cost=Cost(1, disk=1e5
             for row in csv.DictReader(file):
                 if row["region"] == "outside-wedge":
                     band = f"k = {float(row['k from [h/Mpc]']):g} to {float(row['k to [h/Mpc]']):g} h/Mpc"
-                    cell = _with_error(float(row["transfer"]), float(row["transfer error"]))
+                    free = [float(row[f"transfer without flux scale{column}"]) for column in ("", " error")]
+                    given = [float(row[f"transfer{column}"]) for column in ("", " error")]
+                    cell = _with_error(*(free if math.isfinite(free[0]) else given))
                     points.setdefault(row["point"], {})[band] = cell
         bands = list(dict.fromkeys(band for found in points.values() for band in found))
         rows = [(point, *(found[band] for band in bands)) for point, found in points.items()]
-        note = "T = P^R / P^S outside the wedge, one standard deviation."
+        note = (
+            "T = P^R / P^S outside the wedge, free of the error of the flux scale where the true gains are known, one "
+            "standard deviation."
+        )
         return [Table(("point", *bands), rows, "Signal loss of every point", note)]
 
 
@@ -271,8 +277,10 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _transfer(found: TransferFunction, band: int) -> str:
-    """Write T with its error, and say where it is not measured."""
+    """Write T with its error, free of the flux scale if that is known, and say where it is not measured."""
     value, error = found.transfer[band], found.transfer_error[band]
+    if math.isfinite(found.flux_scale):
+        value, error = found.scale_free_transfer[band], found.scale_free_transfer_error[band]
     if not math.isfinite(value):
         return "not measured" if math.isfinite(found.signal[band]) else "no modes"
     return marked(_with_error(value, error), value, error)

@@ -137,8 +137,8 @@ def test_a_run_without_a_role_has_a_sentence_in_place_of_the_table(folder):
     assert "Claims of the paper" not in page_of(folder).words
 
 
-def save_transfer(path: Path, values: list[float]) -> None:
-    """Without a T, a bin has no modes."""
+def save_transfer(path: Path, values: list[float], scale: float = 1.1) -> None:
+    """Save T s^2; without one, a bin has no modes. A scale that is NaN leaves T alone, as of measured data."""
     numbers, error = np.array(values), np.full(len(values), 0.01)
     edges = 0.1 * np.arange(1, len(values) + 2)
     found = TransferFunction(
@@ -146,10 +146,11 @@ def save_transfer(path: Path, values: list[float]) -> None:
         | {
             "bin_edges": edges,
             "k": edges[1:],
-            "transfer": numbers,
+            "transfer": numbers if np.isnan(scale) else numbers / scale**2,
+            "scale_free_transfer": numbers * scale / scale,
             "squared_coherence": numbers,
             "signal": numbers,
-            "flux_scale": 1.0,
+            "flux_scale": scale,
         }
         | {"squared_coherence_error": 2 * error}
     )
@@ -158,7 +159,7 @@ def save_transfer(path: Path, values: list[float]) -> None:
 
 def test_tables_of_products_are_in_the_page_as_they_were_written(folder):
     save_transfer(folder / "transfer-bands.outside-wedge.h5", [0.25, 0.9])
-    save_transfer(folder / "transfer-bands.inside-wedge.h5", [0.03, float("nan")])
+    save_transfer(folder / "transfer-bands.inside-wedge.h5", [0.03, float("nan")], scale=float("nan"))
     needed = dict.fromkeys(("signal", "response", "cross", "spectra", "scale"))
     shown = Transfer("signal loss", power=PowerSettings(), **needed).shown(folder)
     assert [tuple(row) for row in shown[0].rows] == [
@@ -175,7 +176,8 @@ def test_the_summary_of_a_sweep_has_a_row_per_point(tmp_path):
     for point, value in (("01-a", 0.5), ("02-b", 0.25)):
         inputs[point] = tmp_path / point
         inputs[point].mkdir()
-        save_transfer(inputs[point] / "transfer-bands.outside-wedge.h5", [value, 0.75])
+        scale = 1.1 if point == "01-a" else float("nan")
+        save_transfer(inputs[point] / "transfer-bands.outside-wedge.h5", [value, 0.75], scale)
         save_transfer(inputs[point] / "transfer-bands.inside-wedge.h5", [0.1, 0.1])
     points = [{"label": point, "changes": {"x": "1"}} for point in inputs]
     summary = SweepSummary("all points", points=points, transfers=inputs)
