@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -93,38 +93,59 @@ ERRORS_GROUP = "GainErrors"
 """Group of a CalH5 file, beside those of the format, with the standard deviations `amplitude` and `phase` (rad)."""
 
 
-def write_gain_errors(path: Path, amplitude: np.ndarray, phase: np.ndarray) -> None:
-    """Add standard deviations of |g| and of the phase of g to a CalH5 file, with the axes of its gains; NaN is none."""
+class ErrorsOfFile(NamedTuple):
+    """Standard deviations of the gains of a file, with their axes; NaN is none.
+
+    Attributes
+    ----------
+    amplitude, phase : of |g| and of the phase of g in rad, (Nants, Nfreqs, Ntimes, Npols)
+    smooth_delay
+        Largest delay, s, of sequences in frequency that are no part of the errors; zero if there are none, NaN if the
+        file does not say it.
+    """
+
+    amplitude: np.ndarray
+    phase: np.ndarray
+    smooth_delay: float
+
+
+def write_gain_errors(path: Path, errors: ErrorsOfFile) -> None:
+    """Add errors to a CalH5 file of gains."""
     import h5py
 
     with h5py.File(path, "a") as file:
         group = file.create_group(ERRORS_GROUP)
-        for name, values in (("amplitude", amplitude), ("phase", phase)):
+        group.attrs["smooth_delay"] = errors.smooth_delay
+        for name, values in (("amplitude", errors.amplitude), ("phase", errors.phase)):
             group.create_dataset(name, data=values.astype(np.float32), compression="gzip")
 
 
-def find_gain_errors(path: Path) -> np.ndarray | None:
-    """Read what `write_gain_errors` added, (2, Nants, Nfreqs, Ntimes, Npols), or return None if there is none."""
+def find_gain_errors(path: Path) -> ErrorsOfFile | None:
+    """Read what `write_gain_errors` added, or return None if there is none, as in files that are not HDF5."""
     import h5py
 
+    if not h5py.is_hdf5(path):
+        return None
     with h5py.File(path) as file:
         if ERRORS_GROUP not in file:
             return None
-        return np.stack([file[ERRORS_GROUP][name][()] for name in ("amplitude", "phase")])
+        group = file[ERRORS_GROUP]
+        smooth_delay = float(group.attrs.get("smooth_delay", np.nan))
+        return ErrorsOfFile(group["amplitude"][()], group["phase"][()], smooth_delay)
 
 
-def read_gain_errors(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the errors of |g| and of the phase, (Nants, Nfreqs, Ntimes, Npols); raises InputError if there are none."""
+def read_gain_errors(path: Path) -> ErrorsOfFile:
+    """Read what `write_gain_errors` added; raises InputError if there is none."""
     found = find_gain_errors(path)
     if found is None:
         raise InputError(
             f"{path}: has no errors of gains, because none are known for its calibration, or it is of a version that "
             "wrote none"
         )
-    return found[0], found[1]
+    return found
 
 
-def draw_gains(cal: UVCal, errors: tuple[np.ndarray, np.ndarray], solves: Sequence[slice], seed: int) -> UVCal:
+def draw_gains(cal: UVCal, errors: ErrorsOfFile, solves: Sequence[slice], seed: int) -> UVCal:
     """Return gains that deviate from given ones by a draw of their errors, independent by antenna and channel.
 
     Errors are those of `read_gain_errors`; gains without an error stay as they are. Integrations that were solved
@@ -133,7 +154,7 @@ def draw_gains(cal: UVCal, errors: tuple[np.ndarray, np.ndarray], solves: Sequen
     deviation = np.random.default_rng(seed).standard_normal((2, *cal.gain_array.shape))
     for times in solves:
         deviation[..., times, :] = deviation[..., times.start : times.start + 1, :]
-    amplitude, phase = deviation * np.nan_to_num([errors[0] / np.abs(cal.gain_array), errors[1]])
+    amplitude, phase = deviation * np.nan_to_num([errors.amplitude / np.abs(cal.gain_array), errors.phase])
     drawn = cal.copy()
     drawn.gain_array = cal.gain_array * np.exp(amplitude + 1j * phase)
     return drawn

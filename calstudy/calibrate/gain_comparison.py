@@ -1,4 +1,12 @@
-"""Compare two sets of gains, free of the degeneracies of calibration."""
+"""Compare two sets of gains, free of the degeneracies of calibration, and in units of their errors.
+
+Errors of gains leave out what no data determine, and gains that are smooth in frequency where foregrounds are free
+(`calstudy.calibrate.gain_errors`). These are taken out of ln (g1 / g2) before it is divided by the errors of both:
+
+    pull = Re or Im of ln (g1 / g2) / sqrt(sigma_1^2 + sigma_2^2),
+
+with a mean square of one if the gains differ by noise alone.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +16,10 @@ import numpy as np
 from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import SAME_CHANNEL
+from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile
 from calstudy.calibrate.agreement import TAPER, aligned_gains
 from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.calibrate.gain_errors import determined_spans
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.delay import channel_width, delay_transform, delays
 
@@ -32,6 +41,10 @@ class GainPair:
     frequency : channel centres, Hz, (Nfreqs,)
     polarization : name of the feed
     first, second : complex, (Ntimes, Nants, Nfreqs), of the convention "divide"
+    errors
+        Of the real and the imaginary part of ln (first / second), (2, Ntimes, Nants, Nfreqs), NaN where there is none;
+        None if they are not known.
+    smooth_delay : largest delay, s, of sequences in frequency that are no part of the errors
     """
 
     antennas: np.ndarray
@@ -40,6 +53,8 @@ class GainPair:
     polarization: str
     first: np.ndarray
     second: np.ndarray
+    errors: np.ndarray | None = None
+    smooth_delay: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +67,9 @@ class GainDifference:
     as_given : difference before the alignment, of all antennas together
     of_antenna, of_channel : (Nants,) and (Nfreqs,); NaN where there are no gains
     delay, of_delay : s, ascending, and the ratio of the Blackman-Harris tapered transforms, (Ndelays,)
+    pulls
+        Deviations of amplitudes and phases over their errors, (2, Ntimes, Nants, Nfreqs), NaN where there are none;
+        None if errors are not known.
     """
 
     pair: GainPair
@@ -60,6 +78,7 @@ class GainDifference:
     of_channel: np.ndarray
     delay: np.ndarray
     of_delay: np.ndarray
+    pulls: np.ndarray | None = None
 
     @property
     def together(self) -> float:
@@ -68,12 +87,14 @@ class GainDifference:
         return float(np.sqrt(squares[0] / squares[1]))
 
 
-def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
-    """Select the gains that two files have in common.
+def pair_gains(
+    first: UVCal, second: UVCal, polarization: int = 0, errors: tuple[ErrorsOfFile, ErrorsOfFile] | None = None
+) -> GainPair:
+    """Select the gains that two files have in common, and combine their errors.
 
     Gains may be of either convention. An integration of the first is compared with the closest of the second.
-    `polarization` is the index among the feeds that both have. Raises InputError if a file holds delays, or if the two
-    have no antennas, no such feed, or not the same channels in common.
+    `polarization` is the index among the feeds that both have. Errors have the axes of the gains. Raises InputError if
+    a file holds delays, or if the two have no antennas, no such feed, or not the same channels in common.
     """
     for name, cal in (("first", first), ("second", second)):
         if cal.cal_type != "gain":
@@ -92,6 +113,13 @@ def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
     closest = np.abs(times[1][None] - times[0][:, None]).argmin(axis=1)
     values, known = zip(*(_gains(cal, numbers, feeds[polarization]) for cal in (first, second)), strict=True)
     used = known[0] & known[1][closest]
+    combined = None
+    if errors is not None:
+        parts = [
+            _relative_errors(cal, of, numbers, feeds[polarization])
+            for cal, of in zip((first, second), errors, strict=True)
+        ]
+        combined = np.where(used, np.hypot(parts[0], parts[1][:, closest]), np.nan)
     telescope = first.telescope
     rows = [int(np.flatnonzero(telescope.antenna_numbers == number)[0]) for number in numbers]
     return GainPair(
@@ -101,15 +129,29 @@ def pair_gains(first: UVCal, second: UVCal, polarization: int = 0) -> GainPair:
         polarization={-5: "x", -6: "y", -1: "r", -2: "l"}.get(feeds[polarization], str(feeds[polarization])),
         first=np.where(used, values[0], 0),
         second=np.where(used, values[1][closest], 0),
+        errors=combined,
+        smooth_delay=0.0 if errors is None else max(one.smooth_delay for one in errors),
     )
+
+
+def _of_feed(cal: UVCal, array: np.ndarray, numbers: np.ndarray, feed: int) -> np.ndarray:
+    """Return (Ntimes, Nants, Nfreqs), channels ascending, of an array with the axes of the gains."""
+    rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
+    column = int(np.flatnonzero(cal.jones_array == feed)[0])
+    return np.moveaxis(array[rows][..., column][:, np.argsort(np.ravel(cal.freq_array))], 2, 0)
+
+
+def _relative_errors(cal: UVCal, errors: ErrorsOfFile, numbers: np.ndarray, feed: int) -> np.ndarray:
+    """Return the errors of the real and the imaginary part of ln g, (2, Ntimes, Nants, Nfreqs)."""
+    relative = np.divide(
+        errors.amplitude, np.abs(cal.gain_array), out=np.full(errors.amplitude.shape, np.nan), where=cal.gain_array != 0
+    )
+    return np.stack([_of_feed(cal, part, numbers, feed) for part in (relative, errors.phase)])
 
 
 def _gains(cal: UVCal, numbers: np.ndarray, feed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return gains and the mask of valid ones, (Ntimes, Nants, Nfreqs), channels ascending."""
-    rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
-    column = int(np.flatnonzero(cal.jones_array == feed)[0])
-    order = np.argsort(np.ravel(cal.freq_array))
-    gains, flags = (np.moveaxis(array[rows][..., column][:, order], 2, 0) for array in (cal.gain_array, cal.flag_array))
+    gains, flags = (_of_feed(cal, array, numbers, feed) for array in (cal.gain_array, cal.flag_array))
     known = ~flags & np.isfinite(gains) & (gains != 0)
     values = np.where(known, gains, 1)
     return np.where(known, 1 / values if cal.gain_convention == "multiply" else values, 0), known
@@ -138,13 +180,31 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         for values in (difference, pair.second)
     ]
     return GainDifference(
-        pair=GainPair(pair.antennas, pair.positions, pair.frequency, pair.polarization, aligned, pair.second),
+        pair=replace(pair, first=aligned),
         as_given=float(_relative(pair.first - pair.second, pair.second, (0, 1, 2))),
         of_antenna=_relative(difference, pair.second, (0, 2)),
         of_channel=_relative(difference, pair.second, (0, 1)),
         delay=delays(pair.frequency.size, width),
         of_delay=np.sqrt(power[0] / power[1]),
+        pulls=None if pair.errors is None else _pulls(replace(pair, first=aligned), pair.errors),
     )
+
+
+def _pulls(pair: GainPair, errors: np.ndarray) -> np.ndarray:
+    """Return deviations of aligned gains over their errors, (2, Ntimes, Nants, Nfreqs); NaN where there are none."""
+    known = np.isfinite(errors).all(axis=0) & (pair.first != 0) & (pair.second != 0)
+    found = np.full(errors.shape, np.nan)
+    for at in np.flatnonzero(known.any(axis=(1, 2))):
+        ratio = np.divide(pair.first[at], pair.second[at], out=np.ones(known[at].shape, complex), where=known[at])
+        spans = determined_spans(pair.frequency, pair.smooth_delay, known[at])
+        change = np.stack([span @ (span.T @ row) for span, row in zip(spans, np.log(ratio), strict=True)])
+        power = np.where(known[at], np.abs(pair.second[at]) ** 2, 0)
+        total = power.sum(axis=0)
+        scale = np.sum(power * change.real) / total.sum()
+        phase = np.sum(power * change.imag, axis=0) / np.where(total > 0, total, 1)
+        deviation = np.stack([change.real - scale, change.imag - phase])
+        found[:, at] = np.where(known[at], deviation / errors[:, at], np.nan)
+    return found
 
 
 def _relative(difference: np.ndarray, gains: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:

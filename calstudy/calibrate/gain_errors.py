@@ -174,7 +174,7 @@ def gain_errors(
         return "the fit has as many unknowns as data, and leaves no residual that tells the noise"
     free = not problem.frozen and not tangent.finite
     delay = ORDERS * max(bucket.half_width for bucket in structure.basis.buckets) if free else 0.0
-    spans = _spans(has_data, _smooth(frequencies, delay, has_data) if free else None)
+    spans = determined_spans(frequencies, delay, has_data)
     if not any(span.size for span in spans):
         return f"foregrounds can follow gains up to delays of {delay * 1e9:.0f} ns, and the channels resolve no others"
     unknowns = 2 * sum(span.shape[1] for span in spans)
@@ -287,17 +287,16 @@ class ErrorsInTime:
         return last.absorbed
 
 
-def _smooth(frequencies: np.ndarray, delay: float, has_data: np.ndarray) -> np.ndarray:
-    """Return the sequences up to a delay, (Nfreqs, Nsmooth), in the band that foregrounds are modelled in."""
-    channels = np.flatnonzero(has_data.any(axis=0))
-    return gain_vectors(frequencies, delay, slice(int(channels[0]), int(channels[-1]) + 1))
+def determined_spans(frequencies: np.ndarray, delay: float, has_data: np.ndarray) -> list[np.ndarray]:
+    """Return an orthonormal basis, (Nfreqs, N), of what each antenna has in channels with data beyond a delay in s.
 
-
-def _spans(has_data: np.ndarray, smooth: np.ndarray | None) -> list[np.ndarray]:
-    """Return an orthonormal basis, (Nfreqs, N), of what each antenna has in channels with data beside smooth sequences.
-
-    These are (Nfreqs, Nsmooth), or None for all that it has.
+    Smooth sequences are those of the band that foregrounds are modelled in, from the first to the last channel with
+    data, (Nants, Nfreqs). A delay of zero leaves none out.
     """
+    smooth = None
+    if delay > 0:
+        channels = np.flatnonzero(has_data.any(axis=0))
+        smooth = gain_vectors(frequencies, delay, slice(int(channels[0]), int(channels[-1]) + 1))
     known: dict[bytes, np.ndarray] = {}
     for used in has_data:
         if used.tobytes() in known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import statistics
 import sys
@@ -20,6 +21,7 @@ from calstudy.cli.options import MaxMemory, Overwrite, named_as_options
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from calstudy.base.gains import ErrorsOfFile
     from calstudy.calibrate.gain_comparison import GainDifference
 
 
@@ -268,7 +270,8 @@ def compare_gains(
     """Compare two files of gains by antenna, channel and delay.
 
     Antennas, feeds and channels that are in one file only are left out. One phase in every channel and one real
-    scale are removed in every integration, because no data determine them.
+    scale are removed in every integration, because no data determine them. If both files have errors of gains, the
+    difference is given in units of them as well.
     """
     from calstudy.base.gain_files import read_gain_pair
     from calstudy.base.gains import at_common_channels
@@ -278,8 +281,11 @@ def compare_gains(
     from calstudy.products.files import quiet_libraries
 
     with quiet_libraries():
-        files = at_common_channels(*read_gain_pair(first, second))
-        found = compare_gains(pair_gains(*files, feed), redundant)
+        files = read_gain_pair(first, second)
+        common = at_common_channels(*files)
+        whole = all(one is other for one, other in zip(files, common, strict=True))
+        errors = _errors_of_both(first, second) if whole and not redundant else None
+        found = compare_gains(pair_gains(*common, feed, errors), redundant)
     numbers = _numbers(found)
     for name, value in numbers.items():
         typer.echo(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
@@ -290,6 +296,34 @@ def compare_gains(
     path = folder / f"{NAME}.json"
     path.write_text(json.dumps(numbers, indent=1), encoding="utf-8")
     typer.echo(f"{path}")
+
+
+def _errors_of_both(first: Path, second: Path) -> tuple[ErrorsOfFile, ErrorsOfFile] | None:
+    """Read the errors of gains of two files; None if one of them has none, or does not say what they leave out."""
+    from calstudy.base.gains import find_gain_errors
+
+    errors = find_gain_errors(first), find_gain_errors(second)
+    if errors[0] is None or errors[1] is None or not math.isfinite(errors[0].smooth_delay + errors[1].smooth_delay):
+        return None
+    return errors[0], errors[1]
+
+
+def _in_units_of_errors(found: GainDifference) -> dict[str, float | str]:
+    """Return chi^2 and the fractions of the differences within 1 and 1.96 errors, of amplitudes and phases."""
+    import numpy as np
+
+    from calstudy.calibrate.agreement import ALLOWED, LIMITS, PARTS
+
+    numbers: dict[str, float | str] = {}
+    for name, pulls in zip(PARTS, () if found.pulls is None else found.pulls, strict=False):
+        known = np.abs(pulls[np.isfinite(pulls)])
+        if not known.size:
+            continue
+        within = " and ".join(f"{100 * np.mean(known < limit):.1f}" for limit in LIMITS)
+        expected = " and ".join(f"{100 * fraction:.1f}" for fraction, _ in ALLOWED)
+        numbers[f"chi-squared per {name}"] = float(np.mean(known**2))
+        numbers[f"{name}s within 1 and 1.96 errors"] = f"{within} % ({expected} % if noise alone makes the difference)"
+    return numbers
 
 
 def _numbers(found: GainDifference) -> dict[str, float | int | str]:
@@ -308,6 +342,7 @@ def _numbers(found: GainDifference) -> dict[str, float | int | str]:
         "difference of the worst channel": float(np.nanmax(found.of_channel)),
         "worst delay [ns]": float(1e9 * found.delay[np.argmax(found.of_delay)]),
         "difference at the worst delay": float(found.of_delay.max()),
+        **_in_units_of_errors(found),
     }
 
 

@@ -311,6 +311,7 @@ class DiagnosticsFigure(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Draw the diagnostics of the first polarization."""
         data = read_visibilities(job.inputs["data"] / DATA)
-        errors = find_gain_errors(job.inputs["errors"] / GAINS) if self.gain_errors else None
+        known = find_gain_errors(job.inputs["errors"] / GAINS) if self.gain_errors else None
+        errors = None if known is None else np.stack([known.amplitude, known.phase])
         found = diagnose(data, read_result(job.inputs["calibration"]), errors)
         return Drawing(draw_diagnostics(found), found)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import write_gain_errors
+from calstudy.base.gains import ErrorsOfFile, write_gain_errors
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import positions, to_cube
 from calstudy.calibrate.agreement import GainCoverage, pulls
@@ -143,13 +143,14 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         result = read_result(self.calibration)
         errors = np.full((2, *result.gains.gain_array.shape), np.nan)
         records: list[dict[str, Any]] = []
-        drowned = 0
+        drowned, smooth_delay = 0, 0.0
         for solve in self.solves(result):
             if isinstance(solve.errors, str):
                 records.append({"reason": solve.errors})
                 continue
             lost = solve.errors.lost
             drowned += solve.errors.drowned
+            smooth_delay = max(smooth_delay, solve.errors.smooth_delay)
             found = np.stack([solve.errors.amplitude, solve.errors.phase])
             found[:, lost] = np.nan
             errors[..., solve.place][:, solve.rows, :, solve.times] = found[..., None]
@@ -159,7 +160,7 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
             records.append(solve.errors.summary(solve.gains) | {"lost_antennas": dict(zip(names, both, strict=True))})
         result.gains.write_calh5(output / GAINS)
         if np.isfinite(errors).any():
-            write_gain_errors(output / GAINS, *errors)
+            write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay))
         write_json(output / ERRORS, {"records": records})
         away = sum(record.get("reason") == RAN_AWAY for record in records)
         warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if away else []

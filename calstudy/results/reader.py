@@ -233,12 +233,12 @@ def gain_errors(path: Path) -> xarray.Dataset:
     import xarray
     from pyuvdata import UVCal
 
-    amplitude, phase = read_gain_errors(path)
+    errors = read_gain_errors(path)
     gains = UVCal.from_file(path)
     places = {"antenna": gains.ant_array, "frequency": gains.freq_array, "time": gains.time_array}
     coordinates = {**places, "feed": gains.jones_array}
     found = xarray.Dataset(
-        {"amplitude": (tuple(coordinates), amplitude), "phase": (tuple(coordinates), phase)}, coordinates
+        {name: (tuple(coordinates), getattr(errors, name)) for name in ("amplitude", "phase")}, coordinates
     )
     for name, unit in (("phase", "rad"), ("frequency", "Hz"), ("time", "JD")):
         found[name].attrs["units"] = unit

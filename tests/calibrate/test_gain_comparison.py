@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from command_line import run_command
 from toy import FREQUENCIES, complex_normal, make_toy, scattered
 from toy_data import make_uvdata
 
+import calstudy
 from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
 from calstudy.calibrate.gain_comparison import GainPair, compare_gains, pair_gains
@@ -154,3 +156,28 @@ def test_the_command_writes_numbers_and_a_figure(template, gains, tmp_path, caps
     assert status == 2
     assert "the second file" in told
     assert "no such file" in told
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_gains_of_two_noise_realizations_differ_by_their_errors_and_others_by_more(tmp_path, capsys):
+    """Of calamity, whose errors leave smooth gains out: chi^2 is one for equal gains and above it for others."""
+    toy = make_toy(scattered(10), noise=1e-2)
+    size = np.sqrt(np.mean(np.abs(toy.noise) ** 2))
+    rng = np.random.default_rng(8)
+    # Gains that differ by three times their errors, which are about a third of the noise over the signal.
+    moved = toy.gains * (1 + 1e-2 * complex_normal(rng, toy.gains.shape))
+    settings = {"basis": {"min_delay": "50 ns", "buffer": "50 ns"}, "weights": "flags"}
+    for name, gains in (("one", toy.gains), ("two", toy.gains), ("moved", moved)):
+        measured = replace(toy, gains=gains, noise=size * complex_normal(rng, toy.noise.shape))
+        make_uvdata(measured, n_times=1).write_uvh5(tmp_path / f"{name}.uvh5")
+        calstudy.calibrate_data(tmp_path / f"{name}.uvh5", tmp_path / name, quiet=True, **settings)
+    found = {}
+    for name in ("two", "moved"):
+        files = [tmp_path / part / "gains.calh5" for part in ("one", name)]
+        status, told = run_command(capsys, "compare-gains", *files, "--output", tmp_path / name)
+        assert status == 0, told
+        numbers = json.loads((tmp_path / name / "gain-comparison.json").read_text())
+        found[name] = [numbers[f"chi-squared per {part}"] for part in ("amplitude", "phase")]
+    # About 300 numbers each, whose chi^2 scatters by 0.08.
+    assert found["two"] == pytest.approx([1, 1], abs=0.25)
+    assert min(found["moved"]) > 2
