@@ -14,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from toy import BASIS, FREQUENCIES, HEX, complex_normal, make_toy, scattered
-from toy_structures import redundant_structure, turned
+from toy_structures import prior_structure, redundant_structure, turned
 
 from calstudy.calibrate.basis import gain_vectors, make_basis
 from calstudy.calibrate.degeneracy import fix_degeneracies
+from calstudy.calibrate.deviation import estimate
 from calstudy.calibrate.gain_errors import ErrorsInTime, gain_errors
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
@@ -30,16 +31,25 @@ SEVEN, FIVE, TEN = (make_toy(positions, noise=0.0) for positions in (HEX, scatte
 # Amplitudes of antennas that differ by 30 %.
 UNEQUAL = replace(TEN, gains=TEN.gains * np.random.default_rng(8).lognormal(0, 0.3, (10, 1)))
 DEVIATION = 0.02
+FINITE = ("prior", "both", "estimated")
+"""Of each baseline by itself, that and shared by groups, and of each baseline with the deviation from the data."""
 RIGHT = (0.6827, 0.95)
+WRONG_GUESS = 5.0
+"""First deviation over the true one, where the data tell it."""
 
 
 def draw_in_basis(structure, rng):
-    """Foregrounds of variance one per channel in the basis of a prior, independent by baseline."""
-    found = np.zeros((structure.n_baselines, structure.n_frequencies), complex)
-    for bucket in structure.basis.buckets:
-        for p in bucket.members:
-            found[p] = bucket.vectors @ complex_normal(rng, (bucket.vectors.shape[1],))
-    return found
+    """Foregrounds of variance one per channel in a prior's basis, of each baseline, or of that and of its group."""
+    vectors = {index: bucket.vectors for bucket in structure.basis.buckets for index in bucket.members}
+
+    def drawn(index):
+        return vectors[index] @ complex_normal(rng, (vectors[index].shape[1],))
+
+    found = np.array([drawn(group) for group in structure.groups])
+    if structure.prior == "both":
+        shared = {group: drawn(group) for group in sorted(set(structure.groups.tolist()))}
+        found += np.array([shared[group] for group in structure.groups.tolist()])
+    return turned(structure, found)
 
 
 def within_basis(structure, foregrounds):
@@ -62,7 +72,9 @@ def flags_of(shape, structure):
 def structure_of(kind, toy):
     if kind == "redundant":
         return redundant_structure(toy)
-    if kind != "prior":
+    if kind == "both":
+        return prior_structure(toy, "both")
+    if kind not in FINITE:
         return toy.structure
     basis = make_basis(np.linalg.norm(toy.vectors, axis=1), FREQUENCIES, BASIS, prior=True)
     return replace(FitStructure.per_baseline(toy.antennas, len(toy.positions), basis), prior="own")
@@ -77,10 +89,24 @@ def parts_of(toy, kind, noise, flagged):
     rms = np.sqrt(np.mean(np.abs(sky) ** 2))
     weights = flag_weights(flags_of(sky.shape, structure) if flagged else np.zeros(sky.shape, bool))
     known = {"sky_model": sky, "frozen": True} if kind == "sky" else {}
-    if kind == "prior":
+    if kind in FINITE:
         weights = np.where(weights > 0, (noise * rms) ** -2, 0)
-        known = {"sky_model": sky, "deviations": (DEVIATION * rms, np.inf), "prior": "none"}
+        own, shared = WRONG_GUESS if kind == "estimated" else 1.0, 1.0 if kind == "both" else np.inf
+        known = {"sky_model": sky, "deviations": (own * DEVIATION * rms, shared * DEVIATION * rms), "prior": "none"}
     return structure, sky, rms, {"weights": weights, **known}
+
+
+def most_likely(problem):
+    """The problem with the deviation that its data tell, after passes as those of a calibration."""
+    for _ in range(10):
+        solution = solve(problem, GaussNewton())
+        found = estimate(problem, solution.gains, solution.model, (3, 4))
+        problem = problem.with_fractions(found.deviations)
+        if found.settled:
+            break
+    assert found.settled
+    assert found.deviations[0] == pytest.approx(DEVIATION, rel=0.2)
+    return problem
 
 
 def pulls(toy=SEVEN, kind="sky", noise=0.01, flagged=False, received=False, wrong=1.0):
@@ -94,15 +120,17 @@ def pulls(toy=SEVEN, kind="sky", noise=0.01, flagged=False, received=False, wron
     for number in range(REALIZATIONS):
         rng = np.random.default_rng([5, number])
         drawn = noise * rms * complex_normal(rng, sky.shape)
-        truth = sky + (wrong * DEVIATION * rms * draw_in_basis(structure, rng) if kind == "prior" else 0)
+        truth = sky + (wrong * DEVIATION * rms * draw_in_basis(structure, rng) if kind in FINITE else 0)
         data = products * (truth + drawn) if received else products * truth + drawn
         problem = toy.problem(structure, visibilities=data, **known)
         if received:
             # The weights of the first fit's gains, as of a second pass.
             problem = problem.weighted_by(solve(problem, GaussNewton()).gains)
+        if kind == "estimated":
+            problem = most_likely(problem)
         solution = solve(problem, GaussNewton())
         # Those of a prior do not follow the residual: one set is good for several realizations.
-        if kind != "prior" or number % 10 == 0:
+        if kind not in ("prior", "both") or number % 10 == 0:
             errors = gain_errors(problem, solution.gains, solution.model, FREQUENCIES)
         aligned = fix_degeneracies(solution.gains, solution.model, replace(problem, initial_gains=toy.gains))[0]
         change = errors.determined(np.log(aligned / toy.gains))
@@ -131,6 +159,8 @@ def is_covered(values, limits=(0.03, 0.02)):
         # As long as all others together.
         pytest.param(SEVEN, {"kind": "redundant"}, marks=pytest.mark.slow),
         (FIVE, {"kind": "prior"}),
+        (SEVEN, {"kind": "both"}),
+        pytest.param(FIVE, {"kind": "estimated"}, marks=pytest.mark.slow),
         pytest.param(UNEQUAL, {}, marks=pytest.mark.slow),
         pytest.param(UNEQUAL, {"kind": "calamity"}, marks=pytest.mark.slow),
     ],
