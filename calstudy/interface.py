@@ -104,7 +104,7 @@ def calibrate_data(
     observed: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     quiet: bool = False,
-    gain_errors: bool = True,
+    gain_errors: bool | int = True,
     **changes: Any,
 ) -> CalibratedData:
     """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
@@ -122,7 +122,8 @@ def calibrate_data(
     quiet
         If true, no progress is printed.
     gain_errors
-        Whether gains get their errors by noise, as without ``--no-gain-errors``.
+        Whether gains get their errors by noise, as without ``--no-gain-errors``. A number is that of
+        ``--gain-error-realizations``, for calibrators whose gains have no errors of their own.
     **changes
         Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
 

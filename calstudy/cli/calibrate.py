@@ -77,6 +77,15 @@ ExpectedLoss = Annotated[
 GainErrors = Annotated[
     bool, typer.Option(help="Give gains their errors by noise; about a third of the time of the solves.")
 ]
+Realizations = Annotated[
+    int | None,
+    typer.Option(
+        "--gain-error-realizations",
+        min=2,
+        metavar="N",
+        help="For calibrators without errors of gains: find them by N more calibrations, of realizations of the noise.",
+    ),
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Read and check everything, say what would be done, and stop.")]
 
 
@@ -96,6 +105,7 @@ def calibrate(
     output: Output = Path("calibrated"),
     also: Also = None,
     gain_errors: GainErrors = True,
+    gain_error_realizations: Realizations = None,
     expected_loss: ExpectedLoss = False,
     overwrite: Overwrite = False,
     max_memory: MaxMemory = None,
@@ -122,6 +132,8 @@ def calibrate(
     }
     if max_memory is not None:
         parse_memory(max_memory)
+    if gain_error_realizations and not gain_errors:
+        raise InputError("--gain-error-realizations, --no-gain-errors: choose one")
     sections = {
         "observed": {
             "data": [str(path) for path in data],
@@ -131,7 +143,7 @@ def calibrate(
         },
         "calibration": _calibration(settings_file, changes),
         "also": also or [],
-        "gain_errors": gain_errors,
+        "gain_errors": gain_error_realizations or gain_errors,
         "expected_loss": expected_loss,
     }
     # They may use the path of the field in an experiment file.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -294,7 +294,11 @@ class DiagnosticsFigure(StudyFigure):
     version: ClassVar[int] = 2
     kind: str = "diagnostics"
 
-    gain_errors: bool = Field(True, description="Draw the errors of gains, and compute them if they are not yet.")
+    gain_errors: bool | Annotated[int, Field(ge=2)] = Field(
+        True,
+        description="Draw the errors of gains, and compute them if they are not yet; a number: by so many realizations "
+        "of the noise where a fit has none of its own.",
+    )
 
     of = ("observed",)
     caption = (
@@ -305,7 +309,7 @@ class DiagnosticsFigure(StudyFigure):
     def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
         """Return the data and the calibration of the first part."""
         part = next(iter(graph.parts.facts))
-        errors = {"errors": observed_gain_errors(graph, part)} if self.gain_errors else {}
+        errors = {"errors": observed_gain_errors(graph, part, self.gain_errors)} if self.gain_errors else {}
         return {"data": observed(graph, part), "calibration": calibrated(graph, part), **errors}
 
     def draw(self, job: Job) -> Drawing:

@@ -14,7 +14,9 @@ from calstudy.base.gains import ErrorsOfFile, write_gain_errors
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import positions, to_cube
 from calstudy.calibrate.agreement import GainCoverage, pulls
+from calstudy.calibrate.execution import cost_of
 from calstudy.calibrate.gain_errors import MOST_UNKNOWNS, ErrorsInTime, GainErrors
+from calstudy.calibrate.gain_realizations import GainRealizations
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
@@ -25,7 +27,7 @@ from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
-    from calstudy.calibrate.records import CalibrationResult
+    from calstudy.calibrate.records import CalibrationResult, Solve
 
 
 ERRORS = "gain-errors.json"
@@ -72,8 +74,8 @@ def solved(graph: Graph, variant: Variant, parity: str) -> dict[str, Any]:
 
 
 @memoize
-def observed_gain_errors(graph: MeasuredGraph, part: str) -> Task:
-    """Return the task of the errors of the gains of a part of measured data."""
+def observed_gain_errors(graph: MeasuredGraph, part: str, wanted: bool | int = True) -> Task:
+    """Return the task of the errors of the gains of a part of measured data; a number is one of realizations."""
     data, section, calibrator = observed.observed(graph, part), graph.experiment.observed, graph.experiment.calibration
     return ErrorsOfGains(
         LABEL,
@@ -82,6 +84,7 @@ def observed_gain_errors(graph: MeasuredGraph, part: str) -> Task:
         data=data,
         sky_model=data if section.sky_model is not None else None,
         levels=data if calibrator.needs_noise else None,
+        realizations=0 if isinstance(wanted, bool) else wanted,
     )
 
 
@@ -100,6 +103,7 @@ class OfSolves(Calibrated):
         if not isinstance(settings, GainFit) or settings.smooth_gains is not None:
             smoothed = "the gains were smoothed after the fit"
             reason = smoothed if isinstance(settings, GainFit) else f"{settings.label} is no fit by least squares"
+            reason += "; a number as gain_errors gives errors by realizations of the noise"
             yield from (SolvedGains(rows, slice(0), 0, nothing, reason) for _ in result.solutions)
             return
         # The solution is known, and a start of its own would cost more than the errors.
@@ -136,7 +140,13 @@ class OfSolves(Calibrated):
 
 
 class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
-    """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged."""
+    """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged.
+
+    If no solve has errors by its own matrix, they come from fits to this many `realizations` of the noise, unless it is
+    zero.
+    """
+
+    realizations: int = 0
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the gains with their errors, and a record for each solve."""
@@ -158,6 +168,9 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
             names = result.gains.ant_array[solve.rows[lost]].tolist()
             both = np.round([solve.errors.signal_to_noise[lost], solve.errors.noise_alone[lost]], 2).T.tolist()
             records.append(solve.errors.summary(solve.gains) | {"lost_antennas": dict(zip(names, both, strict=True))})
+        if self.realizations and all("reason" in record for record in records):
+            errors = GainRealizations(self.calibrator, *self.read(), result, self.realizations).errors()
+            records = [self._by_realizations(result, errors, solve) for solve in result.solutions]
         result.gains.write_calh5(output / GAINS)
         if np.isfinite(errors).any():
             write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay))
@@ -170,8 +183,26 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
                 f"is flagged; {REMEDY}"
             )
         warnings += lost_antennas(records)
-        unevenness = max((record["unevenness"] for record in records if "reason" not in record), default=1.0)
+        unevenness = max((record.get("unevenness", 1.0) for record in records), default=1.0)
         return {"warnings": warnings + lost_in_noise(result.gains.gain_array, errors[0], unevenness)}
+
+    def _by_realizations(self, result: CalibrationResult, errors: np.ndarray, solve: Solve) -> dict[str, Any]:
+        """Return the record of a solve whose errors are from realizations."""
+        place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
+        at = (slice(None), slice(None), solve.integration, place)
+        relative = float(np.nanmedian(errors[0][at] / np.abs(result.gains.gain_array[at])))
+        return {
+            "median_relative_amplitude": relative,
+            "median_phase": float(np.nanmedian(errors[1][at])),
+            "median_signal_to_noise": 1 / relative if relative > 0 else None,
+            "noise_from": "residual",
+            "realizations": self.realizations,
+            "left_out": ["phase"],
+        }
+
+    def _cost(self) -> Cost:
+        own, again = super()._cost(), cost_of(self.calibrator, size_of(self))
+        return Cost(own.seconds + self.realizations * again.seconds, max(own.memory, again.memory), own.disk)
 
 
 def lost_antennas(records: Sequence[Mapping[str, Any]]) -> list[str]:

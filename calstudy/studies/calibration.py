@@ -167,7 +167,11 @@ class CalibrationFile(DataFile):
         (),
         description="Also write the gains as calfits, H5Parm, FITS of hyperdrive, or `.bin` of calibrate (mwaocal).",
     )
-    gain_errors: bool = Field(True, description="Give gains their errors by noise.")
+    gain_errors: bool | Annotated[int, Field(ge=2)] = Field(
+        True,
+        description="Give gains their errors by noise. A number: where a fit has none of its own, find them by so many "
+        "more calibrations, of realizations of the noise; they are known to one over the root of twice their number.",
+    )
     expected_loss: bool = Field(False, description="Also write the signal loss that the fit is expected to cause.")
 
 
@@ -203,7 +207,8 @@ class DataCalibration(DataStudy):
     def tables(self) -> list[Task]:
         """The calibration, its gains again with their errors, its quality, and the signal loss, as far as wanted."""
         expected = [expected_transfer(self.graph, WHOLE)] if self.file.expected_loss else []
-        errors = [observed_gain_errors(self.graph, WHOLE)] if self.file.gain_errors else []
+        wanted = self.file.gain_errors
+        errors = [observed_gain_errors(self.graph, WHOLE, wanted)] if wanted else []
         return [calibrated(self.graph, WHOLE), *errors, quality(self.graph), *expected]
 
     def described(self) -> str:
