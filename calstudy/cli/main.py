@@ -145,6 +145,7 @@ def plan(
 @app.command()
 def claims(
     folder: Annotated[Path, typer.Argument(help="The folder of a finished run or collection.", show_default=False)],
+    others: Annotated[list[Path] | None, typer.Argument(help="More runs, whose verdicts count with these.")] = None,
     paper: Annotated[
         list[str] | None, typer.Option(help="Name of a paper, or a file.py, in place of those that the run names.")
     ] = None,
@@ -159,11 +160,22 @@ def claims(
 
     Writes claims.json and claims.md into the folder. For a collection with studies by the paper's own solver and by
     another one, also writes claims-by-solver.json and claims-by-solver.md.
-    """
-    from calstudy.claims.evaluation import evaluate_folder
-    from calstudy.verdicts.tables import show_verdicts, to_json
 
-    console, evaluated = Console(highlight=False), evaluate_folder(folder, paper or (), run_code)
+    Of several folders the written verdicts are shown together, and none is written: of each statement that of the last
+    folder that evaluates it, so that studies with realizations come last.
+    """
+    from calstudy.claims.evaluation import EvaluatedRun, evaluate_folder
+    from calstudy.results.reader import RunFolder
+    from calstudy.verdicts.tables import combined, show_verdicts, to_json
+
+    console = Console(highlight=False)
+    if others:
+        if paper or run_code:
+            raise InputError("--paper, --run-code: are for a single folder, whose verdicts are found anew")
+        runs = [RunFolder(path) for path in (folder, *others)]
+        evaluated = EvaluatedRun(", ".join(run.name for run in runs), combined(run.claims for run in runs))
+    else:
+        evaluated = evaluate_folder(folder, paper or (), run_code)
     if as_json:
         typer.echo(to_json(evaluated.claims))
         return

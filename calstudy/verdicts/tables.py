@@ -56,6 +56,16 @@ def tally_of_sentences(verdicts: Sequence[Verdict]) -> str:
     return "; ".join(parts)
 
 
+def combined(parts: Iterable[Sequence[Verdict]]) -> list[Verdict]:
+    """Return one verdict for each statement, that of the last part that evaluates it, section by section."""
+    found: dict[str, Verdict] = {}
+    for verdict in (verdict for part in parts for verdict in part):
+        if verdict.name not in found or verdict.verdict != "not evaluated":
+            found[verdict.name] = verdict
+    sections = list(dict.fromkeys(verdict.section for verdict in found.values()))
+    return sorted(found.values(), key=lambda verdict: sections.index(verdict.section))
+
+
 def _some(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 

@@ -19,6 +19,7 @@ from calstudy.verdicts.tables import (
     BY_SOLVER_MARKDOWN,
     CLAIMS_JSON,
     CLAIMS_MARKDOWN,
+    combined,
     from_json,
     measured,
     outcomes_of_sentences,
@@ -158,6 +159,11 @@ def test_sentences_are_counted_and_statements_on_the_simulation_apart(tmp_path):
         "5 statements: 2 supported, 1 contradicted, 1 undecided, 1 not evaluated; "
         "2 statements on the simulation alone: 1 supported, 1 undecided"
     )
+    # Realizations decide, unless they do not evaluate a statement.
+    later = [stated(AtLeast(0), name="third").judge(no), stated(AtLeast(0), both, name="first").unevaluated("no run")]
+    together = combined([verdicts, later])
+    assert [verdict.name for verdict in together] == [verdict.name for verdict in verdicts]
+    assert outcomes_of_sentences(together) == {"both": "mixed", "third": "contradicted", "fourth": "supported"}
     write_claims(verdicts, tmp_path, "run")
     text = (tmp_path / CLAIMS_MARKDOWN).read_text()
     assert tally_of_sentences(verdicts) in text.splitlines()
