@@ -23,6 +23,8 @@ from calstudy.instrument.layouts import antenna_count
 from calstudy.instrument.settings import InstrumentSettings, nominal_beams
 
 
+# PyYAML comes with dask and pyuvdata. ruamel.yaml, for YAML 1.2, would be a second library for thirty lines less here,
+# and reads 010 as ten and 6:24 as a text, which the fields of numbers would have to refuse.
 class _Loader(yaml.SafeLoader):
     """Safe YAML that refuses duplicate keys and reads 1e-9 as a number (as YAML 1.2 does)."""
 
