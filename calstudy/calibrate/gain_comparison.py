@@ -5,7 +5,8 @@ Errors of gains leave out what no data determine, and gains that are smooth in f
 
     pull = Re or Im of ln (g1 / g2) / sqrt(sigma_1^2 + sigma_2^2),
 
-with a mean square of one if the gains differ by noise alone.
+with a mean square of one if the gains differ by independent noise alone. Both errors must leave out the same delays:
+what one of them contains, and the other does not, is taken out of the difference, but not of its error.
 """
 
 from __future__ import annotations

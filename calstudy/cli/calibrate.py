@@ -261,6 +261,7 @@ def _status(records: Sequence[Mapping[str, Any]]) -> int:
 
 
 NAME = "gain-comparison"
+SAME_DELAY = 1e-3
 MOST_NAMES = 40
 """Largest number of antennas that are named on the axis."""
 
@@ -296,7 +297,7 @@ def compare_gains(
         files = read_gain_pair(first, second)
         common = at_common_channels(*files)
         whole = all(one is other for one, other in zip(files, common, strict=True))
-        errors = _errors_of_both(first, second) if whole and not redundant else None
+        errors = _errors_of_both(first, second, "--redundant" if redundant else "" if whole else "other channels")
         found = compare_gains(pair_gains(*common, feed, errors), redundant)
     numbers = _numbers(found)
     for name, value in numbers.items():
@@ -310,14 +311,23 @@ def compare_gains(
     typer.echo(f"{path}")
 
 
-def _errors_of_both(first: Path, second: Path) -> tuple[ErrorsOfFile, ErrorsOfFile] | None:
-    """Read the errors of gains of two files; None if one of them has none, or does not say what they leave out."""
+def _errors_of_both(first: Path, second: Path, obstacle: str) -> tuple[ErrorsOfFile, ErrorsOfFile] | None:
+    """Read the errors of gains of two files; None if one of them has none, or they are not of the same gains.
+
+    Errors that both files have and that are not used are announced, with the obstacle.
+    """
     from calstudy.base.gains import find_gain_errors
 
-    errors = find_gain_errors(first), find_gain_errors(second)
-    if errors[0] is None or errors[1] is None or not math.isfinite(errors[0].smooth_delay + errors[1].smooth_delay):
+    one, other = find_gain_errors(first), find_gain_errors(second)
+    if one is None or other is None:
         return None
-    return errors[0], errors[1]
+    if not math.isclose(one.smooth_delay, other.smooth_delay, rel_tol=SAME_DELAY):
+        delays = " and ".join(f"{1e9 * errors.smooth_delay:.0f}" for errors in (one, other))
+        obstacle = f"they leave out gains of other delays, up to {delays} ns (nan: of an earlier version)"
+    if obstacle:
+        typer.echo(f"calstudy: errors of gains are not compared: {obstacle}", err=True)
+        return None
+    return one, other
 
 
 def _in_units_of_errors(found: GainDifference) -> dict[str, float | str]:

@@ -164,7 +164,7 @@ def test_gains_of_two_noise_realizations_differ_by_their_errors_and_others_by_mo
     toy = make_toy(scattered(10), noise=1e-2)
     size = np.sqrt(np.mean(np.abs(toy.noise) ** 2))
     rng = np.random.default_rng(8)
-    # Gains that differ by three times their errors, which are about a third of the noise over the signal.
+    # Real and imaginary parts move by twice their errors, which are about a third of the noise over the signal.
     moved = toy.gains * (1 + 1e-2 * complex_normal(rng, toy.gains.shape))
     settings = {"basis": {"min_delay": "50 ns", "buffer": "50 ns"}, "weights": "flags"}
     for name, gains in (("one", toy.gains), ("two", toy.gains), ("moved", moved)):
