@@ -102,11 +102,13 @@ class ErrorsOfFile(NamedTuple):
     smooth_delay
         Largest delay, s, of sequences in frequency that are no part of the errors; zero if there are none, NaN if the
         file does not say it.
+    realizations : of the noise, from which the errors are; zero if they are of the fit's own matrix
     """
 
     amplitude: np.ndarray
     phase: np.ndarray
     smooth_delay: float
+    realizations: int = 0
 
 
 def write_gain_errors(path: Path, errors: ErrorsOfFile) -> None:
@@ -115,7 +117,7 @@ def write_gain_errors(path: Path, errors: ErrorsOfFile) -> None:
 
     with h5py.File(path, "a") as file:
         group = file.create_group(ERRORS_GROUP)
-        group.attrs["smooth_delay"] = errors.smooth_delay
+        group.attrs.update(smooth_delay=errors.smooth_delay, realizations=errors.realizations)
         for name, values in (("amplitude", errors.amplitude), ("phase", errors.phase)):
             group.create_dataset(name, data=values.astype(np.float32), compression="gzip")
 
@@ -131,7 +133,8 @@ def find_gain_errors(path: Path) -> ErrorsOfFile | None:
             return None
         group = file[ERRORS_GROUP]
         smooth_delay = float(group.attrs.get("smooth_delay", np.nan))
-        return ErrorsOfFile(group["amplitude"][()], group["phase"][()], smooth_delay)
+        count = int(group.attrs.get("realizations", 0))
+        return ErrorsOfFile(group["amplitude"][()], group["phase"][()], smooth_delay, count)
 
 
 def read_gain_errors(path: Path) -> ErrorsOfFile:

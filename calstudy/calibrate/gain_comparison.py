@@ -7,10 +7,14 @@ Errors of gains leave out what no data determine, and gains that are smooth in f
 
 with a mean square of one if the gains differ by independent noise alone. Both errors must leave out the same delays:
 what one of them contains, and the other does not, is taken out of the difference, but not of its error.
+
+Errors from N realizations of the noise are known to 1 / sqrt(2 (N - 1)). Pulls then have Student's distribution, with
+nu degrees of freedom and a mean square of nu / (nu - 2).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +50,7 @@ class GainPair:
         Of the real and the imaginary part of ln (first / second), (2, Ntimes, Nants, Nfreqs), NaN where there is none;
         None if they are not known.
     smooth_delay : largest delay, s, of sequences in frequency that are no part of the errors
+    freedom : degrees of freedom of the squares of the errors; infinite if they are exact
     """
 
     antennas: np.ndarray
@@ -56,6 +61,7 @@ class GainPair:
     second: np.ndarray
     errors: np.ndarray | None = None
     smooth_delay: float = 0.0
+    freedom: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +138,14 @@ def pair_gains(
         second=np.where(used, values[1][closest], 0),
         errors=combined,
         smooth_delay=0.0 if errors is None else max(one.smooth_delay for one in errors),
+        freedom=np.inf if errors is None else _freedom(errors),
     )
+
+
+def _freedom(errors: Sequence[ErrorsOfFile]) -> float:
+    """Return the degrees of freedom of the sum of two estimates of a variance that are about as large."""
+    inverse = sum(1 / (one.realizations - 1) for one in errors if one.realizations)
+    return 4 / inverse if inverse else np.inf
 
 
 def _of_feed(cal: UVCal, array: np.ndarray, numbers: np.ndarray, feed: int) -> np.ndarray:

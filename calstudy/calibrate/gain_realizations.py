@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from zlib import crc32
 
 import numpy as np
 
@@ -39,7 +40,6 @@ class GainRealizations:
     ----------
     sky, noise : as for `run_calibrator`
     count : number of realizations, 2 or more
-    seed : of the noise
     """
 
     calibrator: Calibrator
@@ -48,7 +48,6 @@ class GainRealizations:
     noise: float | None
     result: CalibrationResult
     count: int
-    seed: int = 0
 
     def errors(self) -> np.ndarray:
         """Return standard deviations of |g| and of the phase, (2, Nants, Nfreqs, Ntimes, Npols); NaN where flagged.
@@ -78,7 +77,9 @@ class GainRealizations:
 
     def _drawn(self, sigma: np.ndarray) -> Iterator[UVData]:
         """Yield the fitted visibilities with noise; baselines that have no model stay as they are."""
-        model, rng = self.result.model, np.random.default_rng(self.seed)
+        model = self.result.model
+        # Other data have other noise.
+        rng = np.random.default_rng(crc32(self.data.data_array.tobytes()))
         rows = rows_of(self.data, antenna_pairs(model))
         fitted = gain_products(self.result.gains, antenna_pairs(model))[0] * to_cube(model)
         for _ in range(self.count):

@@ -219,6 +219,12 @@ def _show(solution: Mapping[str, Any], output: Path, console: Console) -> int:
             f"({worst['decrement_rms']:.2g} rms, in the unit of the data)"
         )
     lines += _about_the_sky_model([record.get("diagnostics", {}) for record in records])
+    reasons = [record["gain_errors"]["reason"] for record in records if "reason" in record.get("gain_errors", {})]
+    lines += [
+        f"no errors of gains in {reasons.count(reason)} of {len(records)} solves: {reason}; N more calibrations find "
+        "them with --gain-error-realizations N"
+        for reason in sorted(set(reasons))
+    ]
     for line in lines:
         console.print(line, markup=False)
     return _status(records)
@@ -262,6 +268,8 @@ def _status(records: Sequence[Mapping[str, Any]]) -> int:
 
 NAME = "gain-comparison"
 SAME_DELAY = 1e-3
+FEWEST_REALIZATIONS = 10
+"""For errors that chi^2 is worth something with."""
 MOST_NAMES = 40
 """Largest number of antennas that are named on the axis."""
 
@@ -319,12 +327,18 @@ def _errors_of_both(first: Path, second: Path, obstacle: str) -> tuple[ErrorsOfF
     from calstudy.base.gains import find_gain_errors
 
     one, other = find_gain_errors(first), find_gain_errors(second)
-    if one is None or other is None:
+    if one is None and other is None:
         return None
-    if not math.isclose(one.smooth_delay, other.smooth_delay, rel_tol=SAME_DELAY):
-        delays = " and ".join(f"{1e9 * errors.smooth_delay:.0f}" for errors in (one, other))
-        obstacle = f"they leave out gains of other delays, up to {delays} ns (nan: of an earlier version)"
-    if obstacle:
+    if one is None or other is None:
+        obstacle = f"{first if one is None else second} has none"
+    elif not math.isclose(one.smooth_delay, other.smooth_delay, rel_tol=SAME_DELAY):
+        delays = [one.smooth_delay, other.smooth_delay]
+        obstacle = "a file of an earlier version does not say what they leave out"
+        if all(map(math.isfinite, delays)):
+            obstacle = f"they leave out gains up to {1e9 * delays[0]:.0f} and {1e9 * delays[1]:.0f} ns"
+    elif fewest := [found.realizations for found in (one, other) if 0 < found.realizations < FEWEST_REALIZATIONS]:
+        obstacle = f"they are of {fewest[0]} realizations, and it takes {FEWEST_REALIZATIONS}"
+    if obstacle or one is None or other is None:
         typer.echo(f"calstudy: errors of gains are not compared: {obstacle}", err=True)
         return None
     return one, other
@@ -333,18 +347,24 @@ def _errors_of_both(first: Path, second: Path, obstacle: str) -> tuple[ErrorsOfF
 def _in_units_of_errors(found: GainDifference) -> dict[str, float | str]:
     """Return chi^2 and the fractions of the differences within 1 and 1.96 errors, of amplitudes and phases."""
     import numpy as np
+    from scipy.stats import t
 
-    from calstudy.calibrate.agreement import ALLOWED, LIMITS, PARTS
+    from calstudy.calibrate.agreement import LIMITS, PARTS
 
     numbers: dict[str, float | str] = {}
-    for name, pulls in zip(PARTS, () if found.pulls is None else found.pulls, strict=False):
+    if found.pulls is None:
+        return numbers
+    freedom, delay = found.pair.freedom, found.pair.smooth_delay
+    expected = " and ".join(f"{100 * (2 * t.cdf(limit, freedom) - 1):.1f}" for limit in LIMITS)
+    square = 1.0 if math.isinf(freedom) else freedom / (freedom - 2)
+    numbers["gains that are compared with their errors"] = f"beyond {1e9 * delay:.0f} ns" if delay > 0 else "all"
+    for name, pulls in zip(PARTS, found.pulls, strict=True):
         known = np.abs(pulls[np.isfinite(pulls)])
         if not known.size:
             continue
         within = " and ".join(f"{100 * np.mean(known < limit):.1f}" for limit in LIMITS)
-        expected = " and ".join(f"{100 * fraction:.1f}" for fraction, _ in ALLOWED)
-        numbers[f"chi-squared per {name}"] = float(np.mean(known**2))
-        numbers[f"{name}s within 1 and 1.96 errors"] = f"{within} % ({expected} % if noise alone makes the difference)"
+        numbers[f"chi-squared per {name}"] = float(np.mean(known**2)) / square
+        numbers[f"{name}s within 1 and 1.96 errors"] = f"{within} % ({expected} % if independent noise makes all of it)"
     return numbers
 
 

@@ -173,6 +173,8 @@ def claims(
         if paper or run_code:
             raise InputError("--paper, --run-code: are for a single folder, whose verdicts are found anew")
         runs = [RunFolder(path) for path in (folder, *others)]
+        if without := [str(run.path) for run in runs if not run.has_claims]:
+            raise InputError(f"{', '.join(without)}: has no verdicts (claims.json)")
         evaluated = EvaluatedRun(", ".join(run.name for run in runs), combined(run.claims for run in runs))
     else:
         evaluated = evaluate_folder(folder, paper or (), run_code)

@@ -103,7 +103,6 @@ class OfSolves(Calibrated):
         if not isinstance(settings, GainFit) or settings.smooth_gains is not None:
             smoothed = "the gains were smoothed after the fit"
             reason = smoothed if isinstance(settings, GainFit) else f"{settings.label} is no fit by least squares"
-            reason += "; a number as gain_errors gives errors by realizations of the noise"
             yield from (SolvedGains(rows, slice(0), 0, nothing, reason) for _ in result.solutions)
             return
         # The solution is known, and a start of its own would cost more than the errors.
@@ -168,15 +167,18 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
             names = result.gains.ant_array[solve.rows[lost]].tolist()
             both = np.round([solve.errors.signal_to_noise[lost], solve.errors.noise_alone[lost]], 2).T.tolist()
             records.append(solve.errors.summary(solve.gains) | {"lost_antennas": dict(zip(names, both, strict=True))})
-        if self.realizations and all("reason" in record for record in records):
+        used = self.realizations if all("reason" in record for record in records) else 0
+        if used:
             errors = GainRealizations(self.calibrator, *self.read(), result, self.realizations).errors()
             records = [self._by_realizations(result, errors, solve) for solve in result.solutions]
         result.gains.write_calh5(output / GAINS)
         if np.isfinite(errors).any():
-            write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay))
+            write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay, used))
         write_json(output / ERRORS, {"records": records})
         away = sum(record.get("reason") == RAN_AWAY for record in records)
         warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if away else []
+        if self.realizations and not used:
+            warnings.append("gains have errors by the fit itself; realizations were not needed, and not made")
         if drowned:
             warnings.append(
                 f"{drowned} of {len(records)} solves: the gains of most antennas cannot be told from noise, and none "

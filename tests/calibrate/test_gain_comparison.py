@@ -13,7 +13,7 @@ from toy_data import make_uvdata
 
 import calstudy
 from calstudy.base.errors import InputError
-from calstudy.base.gains import make_uvcal
+from calstudy.base.gains import ErrorsOfFile, make_uvcal, write_gain_errors
 from calstudy.calibrate.gain_comparison import GainPair, compare_gains, pair_gains
 
 DRAWN = True
@@ -178,6 +178,40 @@ def test_gains_of_two_noise_realizations_differ_by_their_errors_and_others_by_mo
         assert status == 0, told
         numbers = json.loads((tmp_path / name / "gain-comparison.json").read_text())
         found[name] = [numbers[f"chi-squared per {part}"] for part in ("amplitude", "phase")]
+        assert numbers["gains that are compared with their errors"].startswith("beyond")
     # About 300 numbers each, whose chi^2 scatters by 0.08.
     assert found["two"] == pytest.approx([1, 1], abs=0.25)
     assert min(found["moved"]) > 2
+
+
+def with_errors(template, path, gains, size, smooth_delay=0.0, realizations=0):
+    make_uvcal(template, gains).write_calh5(path)
+    shape = make_uvcal(template, gains).gain_array.shape
+    write_gain_errors(path, ErrorsOfFile(np.full(shape, size), np.full(shape, size), smooth_delay, realizations))
+    return path
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_errors_of_realizations_have_a_distribution_of_their_own_and_few_tell_nothing(template, tmp_path, capsys):
+    rng, shape, size = np.random.default_rng(9), (N_ANTENNAS, FREQUENCIES.size, 2, 1), 0.01
+    one, two = (np.exp(size * np.sqrt(2) * complex_normal(rng, shape)) for _ in range(2))
+    first = with_errors(template, tmp_path / "one.calh5", one, size)
+    for count, expected in ((0, "68.3 and 95.0"), (10, "67.6 and 94.2")):
+        # One of two errors is exact, and four times nine degrees of freedom are left.
+        second = with_errors(template, tmp_path / f"{count}.calh5", two, size, realizations=count)
+        status, told = run_command(capsys, "compare-gains", first, second, "--output", tmp_path / "out")
+        assert status == 0, told
+        numbers = json.loads((tmp_path / "out" / "gain-comparison.json").read_text())
+        assert f"({expected} % if" in numbers["amplitudes within 1 and 1.96 errors"]
+        # Of 1152 numbers; the phase of each channel takes a ninth of the imaginary parts.
+        shrunk = 36 / 34 if count else 1
+        assert numbers["chi-squared per amplitude"] == pytest.approx(1 / shrunk, abs=0.15)
+    for name, changes, reason in (
+        ("few", {"realizations": 5}, "of 5 realizations"),
+        ("smooth", {"smooth_delay": 3e-7}, "up to 0 and 300 ns"),
+    ):
+        second = with_errors(template, tmp_path / f"{name}.calh5", two, size, **changes)
+        status, told = run_command(capsys, "compare-gains", first, second, "--output", tmp_path / "out")
+        assert status == 0, told
+        assert reason in told
+        assert "chi-squared" not in (tmp_path / "out" / "gain-comparison.json").read_text()
