@@ -15,7 +15,7 @@ from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gain_pair, read_gains, write_gains
-from calstudy.base.gains import draw_gains, make_uvcal
+from calstudy.base.gains import ErrorsOfFile, draw_gains, make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_indices, from_cube, to_cube
 from calstudy.calibrate.calibrators import ddecal
@@ -462,7 +462,8 @@ def test_drawn_gains_scatter_by_their_errors(world):
     amplitude, phase = np.full(shape, 0.02), np.full(shape, 0.01)
     amplitude[1], phase[2] = 0.05, np.nan
     solves = [slice(0, 2), slice(2, 4)]
-    drawn = np.array([draw_gains(fitted, (amplitude, phase), solves, seed).gain_array[:, ::8] for seed in range(400)])
+    errors = ErrorsOfFile(amplitude, phase, smooth_delay=0.0)
+    drawn = np.array([draw_gains(fitted, errors, solves, seed).gain_array[:, ::8] for seed in range(400)])
     ratio = drawn / fitted.gain_array[:, ::8]
     np.testing.assert_array_equal(ratio[..., 0, :], ratio[..., 1, :])
     assert np.abs(ratio[..., 1, :] - ratio[..., 2, :]).min() > 0
