@@ -50,7 +50,7 @@ class GainPair:
         Of the real and the imaginary part of ln (first / second), (2, Ntimes, Nants, Nfreqs), NaN where there is none;
         None if they are not known.
     smooth_delay : largest delay, s, of sequences in frequency that are no part of the errors
-    freedom : degrees of freedom of the squares of the errors; infinite if they are exact
+    degrees_of_freedom : of the squares of the errors; infinite if they are exact
     """
 
     antennas: np.ndarray
@@ -61,7 +61,7 @@ class GainPair:
     second: np.ndarray
     errors: np.ndarray | None = None
     smooth_delay: float = 0.0
-    freedom: float = np.inf
+    degrees_of_freedom: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +138,11 @@ def pair_gains(
         second=np.where(used, values[1][closest], 0),
         errors=combined,
         smooth_delay=0.0 if errors is None else max(one.smooth_delay for one in errors),
-        freedom=np.inf if errors is None else _freedom(errors),
+        degrees_of_freedom=np.inf if errors is None else _degrees_of_freedom(errors),
     )
 
 
-def _freedom(errors: Sequence[ErrorsOfFile]) -> float:
+def _degrees_of_freedom(errors: Sequence[ErrorsOfFile]) -> float:
     """Return the degrees of freedom of the sum of two estimates of a variance that are about as large."""
     inverse = sum(1 / (one.realizations - 1) for one in errors if one.realizations)
     return 4 / inverse if inverse else np.inf

@@ -354,9 +354,9 @@ def _in_units_of_errors(found: GainDifference) -> dict[str, float | str]:
     numbers: dict[str, float | str] = {}
     if found.pulls is None:
         return numbers
-    freedom, delay = found.pair.freedom, found.pair.smooth_delay
-    expected = " and ".join(f"{100 * (2 * t.cdf(limit, freedom) - 1):.1f}" for limit in LIMITS)
-    square = 1.0 if math.isinf(freedom) else freedom / (freedom - 2)
+    degrees, delay = found.pair.degrees_of_freedom, found.pair.smooth_delay
+    expected = " and ".join(f"{100 * (2 * t.cdf(limit, degrees) - 1):.1f}" for limit in LIMITS)
+    square = 1.0 if math.isinf(degrees) else degrees / (degrees - 2)
     numbers["gains that are compared with their errors"] = f"beyond {1e9 * delay:.0f} ns" if delay > 0 else "all"
     for name, pulls in zip(PARTS, found.pulls, strict=True):
         known = np.abs(pulls[np.isfinite(pulls)])

@@ -167,7 +167,9 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
             names = result.gains.ant_array[solve.rows[lost]].tolist()
             both = np.round([solve.errors.signal_to_noise[lost], solve.errors.noise_alone[lost]], 2).T.tolist()
             records.append(solve.errors.summary(solve.gains) | {"lost_antennas": dict(zip(names, both, strict=True))})
-        used = self.realizations if all("reason" in record for record in records) else 0
+        reasons = [record.get("reason") for record in records]
+        # Realizations of a fit whose weights run away would not tell its errors either.
+        used = self.realizations if all(reasons) and RAN_AWAY not in reasons else 0
         if used:
             errors = GainRealizations(self.calibrator, *self.read(), result, self.realizations).errors()
             records = [self._by_realizations(result, errors, solve) for solve in result.solutions]
@@ -175,9 +177,9 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         if np.isfinite(errors).any():
             write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay, used))
         write_json(output / ERRORS, {"records": records})
-        away = sum(record.get("reason") == RAN_AWAY for record in records)
+        away = reasons.count(RAN_AWAY)
         warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {REMEDY}"] if away else []
-        if self.realizations and not used:
+        if self.realizations and None in reasons:
             warnings.append("gains have errors by the fit itself; realizations were not needed, and not made")
         if drowned:
             warnings.append(
