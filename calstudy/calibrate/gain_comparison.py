@@ -14,6 +14,7 @@ nu degrees of freedom and a mean square of nu / (nu - 2).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,7 +23,7 @@ from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile
-from calstudy.calibrate.agreement import TAPER, aligned_gains
+from calstudy.calibrate.agreement import LIMITS, TAPER, aligned_gains
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.gain_errors import determined_spans
 from calstudy.instrument.layouts import redundant_groups
@@ -33,6 +34,10 @@ REDUNDANT = 1.0
 """m. Baselines that differ by less are redundant."""
 NOT_PARALLEL = 0.3
 """Minimum sine of the angle between two baselines that span the plane."""
+SAME_DELAY = 1e-3
+"""Relative difference of delays up to which two errors leave out the same gains."""
+FEWEST_REALIZATIONS = 10
+"""From which errors are known well enough for chi^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +98,26 @@ class GainDifference:
         squares = [np.sum(np.abs(gains) ** 2) for gains in (self.pair.first - self.pair.second, self.pair.second)]
         return float(np.sqrt(squares[0] / squares[1]))
 
+    @property
+    def chi_squared(self) -> list[float]:
+        """Mean square of the pulls over its expectation, of amplitudes and phases; empty if errors are not known."""
+        degrees = self.pair.degrees_of_freedom
+        expected = 1.0 if math.isinf(degrees) else degrees / (degrees - 2)
+        return [] if self.pulls is None else [float(np.nanmean(part**2)) / expected for part in self.pulls]
+
+    @property
+    def within(self) -> list[list[float]]:
+        """Fractions of amplitudes and of phases within `LIMITS` errors; empty if errors are not known."""
+        known = [] if self.pulls is None else [np.abs(part[np.isfinite(part)]) for part in self.pulls]
+        return [[float(np.mean(part < limit)) for limit in LIMITS] for part in known]
+
+    @property
+    def expected_within(self) -> list[float]:
+        """The same where independent noise makes all of the difference."""
+        from scipy.stats import t
+
+        return [float(2 * t.cdf(limit, self.pair.degrees_of_freedom) - 1) for limit in LIMITS]
+
 
 def pair_gains(
     first: UVCal, second: UVCal, polarization: int = 0, errors: tuple[ErrorsOfFile, ErrorsOfFile] | None = None
@@ -140,6 +165,19 @@ def pair_gains(
         smooth_delay=0.0 if errors is None else max(one.smooth_delay for one in errors),
         degrees_of_freedom=np.inf if errors is None else _degrees_of_freedom(errors),
     )
+
+
+def obstacle(one: ErrorsOfFile, other: ErrorsOfFile) -> str | None:
+    """Explain in a few words why gains are not compared in units of their errors, or return None."""
+    delays = [one.smooth_delay, other.smooth_delay]
+    if not all(map(math.isfinite, delays)):
+        return "a file of an earlier version does not say what they leave out"
+    if not math.isclose(*delays, rel_tol=SAME_DELAY):
+        return f"they leave out gains up to {1e9 * delays[0]:.0f} and {1e9 * delays[1]:.0f} ns"
+    fewest = min((errors.realizations for errors in (one, other) if errors.realizations), default=FEWEST_REALIZATIONS)
+    if fewest < FEWEST_REALIZATIONS:
+        return f"they are of {fewest} realizations, and it takes {FEWEST_REALIZATIONS}"
+    return None
 
 
 def _degrees_of_freedom(errors: Sequence[ErrorsOfFile]) -> float:
@@ -204,9 +242,14 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
     )
 
 
-def _pulls(pair: GainPair, errors: np.ndarray) -> np.ndarray:
-    """Return deviations of aligned gains over their errors, (2, Ntimes, Nants, Nfreqs); NaN where there are none."""
+def _pulls(pair: GainPair, errors: np.ndarray) -> np.ndarray | None:
+    """Return deviations of aligned gains over their errors, (2, Ntimes, Nants, Nfreqs), NaN where there are none.
+
+    None if no gain has errors in both.
+    """
     known = np.isfinite(errors).all(axis=0) & (pair.first != 0) & (pair.second != 0)
+    if not known.any():
+        return None
     found = np.full(errors.shape, np.nan)
     for at in np.flatnonzero(known.any(axis=(1, 2))):
         ratio = np.divide(pair.first[at], pair.second[at], out=np.ones(known[at].shape, complex), where=known[at])

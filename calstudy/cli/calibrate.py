@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import statistics
 import sys
@@ -224,6 +223,7 @@ def _show(solution: Mapping[str, Any], output: Path, console: Console) -> int:
         f"no errors of gains in {reasons.count(reason)} of {len(records)} solves: {reason}; N more calibrations find "
         "them with --gain-error-realizations N"
         for reason in sorted(set(reasons))
+        if not any(reason in warning for warning in solution["warnings"])
     ]
     for line in lines:
         console.print(line, markup=False)
@@ -267,9 +267,6 @@ def _status(records: Sequence[Mapping[str, Any]]) -> int:
 
 
 NAME = "gain-comparison"
-SAME_DELAY = 1e-3
-FEWEST_REALIZATIONS = 10
-"""For errors that chi^2 is worth something with."""
 MOST_NAMES = 40
 """Largest number of antennas that are named on the axis."""
 
@@ -319,53 +316,48 @@ def compare_gains(
     typer.echo(f"{path}")
 
 
-def _errors_of_both(first: Path, second: Path, obstacle: str) -> tuple[ErrorsOfFile, ErrorsOfFile] | None:
-    """Read the errors of gains of two files; None if one of them has none, or they are not of the same gains.
+def _errors_of_both(first: Path, second: Path, other_gains: str) -> tuple[ErrorsOfFile, ErrorsOfFile] | None:
+    """Read the errors of gains of two files; None if they are not compared, which is announced if there are some.
 
-    Errors that both files have and that are not used are announced, with the obstacle.
+    `other_gains` says why errors are not of the gains that are compared, and is empty if they are.
     """
     from calstudy.base.gains import find_gain_errors
+    from calstudy.calibrate.gain_comparison import obstacle
 
     one, other = find_gain_errors(first), find_gain_errors(second)
     if one is None and other is None:
         return None
     if one is None or other is None:
-        obstacle = f"{first if one is None else second} has none"
-    elif not math.isclose(one.smooth_delay, other.smooth_delay, rel_tol=SAME_DELAY):
-        delays = [one.smooth_delay, other.smooth_delay]
-        obstacle = "a file of an earlier version does not say what they leave out"
-        if all(map(math.isfinite, delays)):
-            obstacle = f"they leave out gains up to {1e9 * delays[0]:.0f} and {1e9 * delays[1]:.0f} ns"
-    elif fewest := [found.realizations for found in (one, other) if 0 < found.realizations < FEWEST_REALIZATIONS]:
-        obstacle = f"they are of {fewest[0]} realizations, and it takes {FEWEST_REALIZATIONS}"
-    if obstacle or one is None or other is None:
-        typer.echo(f"calstudy: errors of gains are not compared: {obstacle}", err=True)
-        return None
-    return one, other
+        reason: str | None = f"{first if one is None else second} has none"
+    else:
+        reason = other_gains or obstacle(one, other)
+        if not reason:
+            return one, other
+    typer.echo(f"calstudy: errors of gains are not compared: {reason}", err=True)
+    return None
 
 
 def _in_units_of_errors(found: GainDifference) -> dict[str, float | str]:
-    """Return chi^2 and the fractions of the differences within 1 and 1.96 errors, of amplitudes and phases."""
-    import numpy as np
-    from scipy.stats import t
+    """Return chi^2 and the percentages of the differences within 1 and 1.96 errors, by what they are called."""
+    from calstudy.calibrate.agreement import PARTS
 
-    from calstudy.calibrate.agreement import LIMITS, PARTS
-
-    numbers: dict[str, float | str] = {}
     if found.pulls is None:
-        return numbers
-    degrees, delay = found.pair.degrees_of_freedom, found.pair.smooth_delay
-    expected = " and ".join(f"{100 * (2 * t.cdf(limit, degrees) - 1):.1f}" for limit in LIMITS)
-    square = 1.0 if math.isinf(degrees) else degrees / (degrees - 2)
-    numbers["gains that are compared with their errors"] = f"beyond {1e9 * delay:.0f} ns" if delay > 0 else "all"
-    for name, pulls in zip(PARTS, found.pulls, strict=True):
-        known = np.abs(pulls[np.isfinite(pulls)])
-        if not known.size:
-            continue
-        within = " and ".join(f"{100 * np.mean(known < limit):.1f}" for limit in LIMITS)
-        numbers[f"chi-squared per {name}"] = float(np.mean(known**2)) / square
-        numbers[f"{name}s within 1 and 1.96 errors"] = f"{within} % ({expected} % if independent noise makes all of it)"
+        return {}
+    delay = found.pair.smooth_delay
+    expected = _percentages(found.expected_within)
+    numbers: dict[str, float | str] = {
+        "gains that are compared with their errors": f"beyond {1e9 * delay:.0f} ns" if delay > 0 else "all"
+    }
+    for name, chi_squared, within in zip(PARTS, found.chi_squared, found.within, strict=True):
+        numbers[f"chi-squared per {name}"] = chi_squared
+        numbers[f"{name}s within 1 and 1.96 errors"] = (
+            f"{_percentages(within)} % ({expected} % if independent noise makes all of it)"
+        )
     return numbers
+
+
+def _percentages(fractions: Sequence[float]) -> str:
+    return " and ".join(f"{100 * fraction:.1f}" for fraction in fractions)
 
 
 def _numbers(found: GainDifference) -> dict[str, float | int | str]:

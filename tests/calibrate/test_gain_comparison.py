@@ -215,3 +215,13 @@ def test_errors_of_realizations_have_a_distribution_of_their_own_and_few_tell_no
         assert status == 0, told
         assert reason in told
         assert "chi-squared" not in (tmp_path / "out" / "gain-comparison.json").read_text()
+
+
+def test_without_common_errors_there_is_no_chi_squared(template, gains):
+    cals = [make_uvcal(template, gains), make_uvcal(template, 1.01 * gains)]
+    errors = [ErrorsOfFile(np.full(gains.shape, 0.01), np.full(gains.shape, 0.01), 0.0) for _ in cals]
+    errors[0].amplitude[:4] = np.nan
+    errors[1].amplitude[4:] = np.nan
+    found = compare_gains(pair_gains(*cals, errors=tuple(errors)))
+    assert found.pulls is None
+    assert found.chi_squared == found.within == []
