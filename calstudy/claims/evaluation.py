@@ -24,7 +24,7 @@ from calstudy.results.reader import Results, RunFolder, Tables
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.statement import Statement
-from calstudy.verdicts.tables import tally, write_claims, write_claims_by_solver
+from calstudy.verdicts.tables import CLAIMS_MARKDOWN, tally, write_claims, write_claims_by_solver
 
 
 @dataclass(frozen=True)
@@ -201,9 +201,7 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     run_code : whether Python files in the folder's experiments may be run; those of `papers` always are
     """
     run = RunFolder(folder)
-    if run.parts and not run.members:
-        part = next(iter(run.parts.values())).path
-        raise InputError(f"{folder}: is the folder of several runs; give that of one of them, such as {part}")
+    _require_evaluable(run)
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
         found, by_solver = _evaluated(run, named)
@@ -215,6 +213,18 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     except OSError as error:
         raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
     return evaluated
+
+
+def _require_evaluable(run: RunFolder) -> None:
+    """Raise InputError for the folder of a comparison or sweep, and for a collection without its members' folders."""
+    if not run.members and (run.parts or "cases" in run.manifest):
+        such = f", such as {next(iter(run.parts.values())).path}" if run.parts else ", or of a collection"
+        raise InputError(f"{run.path}: is the folder of several runs; give that of one of them{such}")
+    if lacking := [str(member.path) for member in run.members.values() if not member.path.is_dir()]:
+        written = f"; its written verdicts are in {run.path / CLAIMS_MARKDOWN}" if run.has_claims else ""
+        raise InputError(
+            f"{run.path}: the folders of its members are not beside it ({', '.join(lacking)}); run it again{written}"
+        )
 
 
 def _evaluated(run: RunFolder, named: Sequence[Paper]) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
@@ -327,7 +337,7 @@ def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Tas
     return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
 
 
-class Claims(Task, stage="claims", version=12, cost=Cost(1, disk=1e5)):
+class Claims(Task, stage="claims", version=13, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
 
     papers: Sequence[Any]

@@ -83,6 +83,8 @@ def measured(verdict: Verdict) -> str:
     text = number(verdict.measured, verdict.uncertainty)
     if verdict.kind in ("at least", "at most"):
         return f"{verdict.kind} {text}"
+    if verdict.kind == "scatter":
+        text = text.replace(" ± ", ", scatter ")
     return text if verdict.smallest_effect is None else f"{text}; {visible(verdict.smallest_effect)}"
 
 

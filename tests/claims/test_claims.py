@@ -618,5 +618,18 @@ def test_folders_that_cannot_be_evaluated_are_told(make_study, tmp_path):
     with pytest.raises(InputError, match="'calamity' is not a paper"):
         evaluate_folder(folder, ["calamity"])
     (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "parts": {"a": "points/a"}}))
-    with pytest.raises(InputError, match="is the folder of several runs; give that of one of them"):
+    with pytest.raises(InputError, match="is the folder of several runs; give that of one of them, such as"):
         evaluate_folder(folder)
+    (folder / "manifest.json").write_text(json.dumps({"name": "comparison", "stand_ins": [], "cases": []}))
+    with pytest.raises(InputError, match="is the folder of several runs; give that of one of them, or of a collection"):
+        evaluate_folder(folder)
+
+
+def test_a_collection_without_its_members_says_where_its_verdicts_are(make_study, tmp_path):
+    folder = run_folder(make_study("tables"), tmp_path)
+    manifest = {"name": "collection", "stand_ins": [], "members": {"redundant": "redundant-0123abcd"}, "roles": {}}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    (folder / "claims.json").write_text("[]")
+    with pytest.raises(InputError, match=r"not beside it \(.*redundant-0123abcd\); .*verdicts are in .*claims\.md"):
+        evaluate_folder(folder)
+    assert (folder / "claims.json").read_text() == "[]"

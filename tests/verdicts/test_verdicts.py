@@ -131,7 +131,8 @@ def test_numbers_without_error_bounds_and_scatters_decide(finding, threshold, ou
     verdict = stated(threshold).judge(finding)
     assert verdict.verdict == outcome
     assert from_json(to_json([verdict])) == [verdict]
-    assert (finding.kind in measured(verdict)) == finding.kind.startswith("at ")
+    assert (finding.kind in measured(verdict)) == (finding.kind != "error")
+    assert ("±" in measured(verdict)) == (finding.kind == "error" and finding.uncertainty > 0)
 
 
 def test_what_would_have_been_seen_is_in_the_tables(tmp_path):
