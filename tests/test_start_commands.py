@@ -75,6 +75,8 @@ def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
         (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
         (["fields", "--schema", "nowhere/schema.json"], "--schema nowhere/schema.json: cannot be written"),
+        (["fields", "--schema", "taken.yaml"], "--schema taken.yaml: is another file, and is not overwritten"),
+        (["fields", "calibration", "--schema", "s.json"], "the schema is of whole files; leave out the section"),
         (["runs", "nowhere"], "nowhere: no such folder of runs"),
         (["store", "nowhere"], "nowhere: no such store"),
         (["store", "store", "--delete"], "--delete: say which products"),
@@ -169,13 +171,18 @@ def test_a_plan_as_json_has_the_numbers_of_the_table(here, capsys):
     assert plan["store"] == str(here / "store")
 
 
-def make_product(store: Store, stage: str, key: str, made_from: str | None = None, days: float = 0.0) -> None:
-    """Put a product into a store that was made some days ago."""
+def key_of(letter: str) -> str:
+    return 32 * letter
+
+
+def make_product(store: Store, stage: str, letter: str, made_from: str | None = None, days: float = 0.0) -> None:
+    """Put a product into a store that was made some days ago; its key is a letter, repeated."""
+    key = key_of(letter)
     with store.lock(stage, key), store.building(stage, key) as folder:
         (folder / "data.bin").write_bytes(b"x" * 1000)
         started = (datetime.now(UTC) - timedelta(days=days)).isoformat()
-        inputs = {} if made_from is None else {"data": [stage, made_from]}
-        store.seal(folder, {"stage": stage, "key": key, "label": key, "started": started, "inputs": inputs})
+        inputs = {} if made_from is None else {"data": [stage, key_of(made_from)]}
+        store.seal(folder, {"stage": stage, "key": key, "label": letter, "started": started, "inputs": inputs})
 
 
 @pytest.fixture
@@ -187,13 +194,13 @@ def used_store(here) -> Store:
         make_product(store, "average", key, made_from, days)
     run = here / "runs" / "mine-1234"
     run.mkdir(parents=True)
-    manifest = {"name": "mine", "finished": datetime.now(UTC).isoformat(), "products": [{"key": "b"}]}
+    manifest = {"name": "mine", "finished": datetime.now(UTC).isoformat(), "products": [{"key": key_of("b")}]}
     (run / "manifest.json").write_text(json.dumps(manifest))
     return store
 
 
 def keys(store: Store) -> set[str]:
-    return {path.name for path in (store.root / "average").iterdir() if not path.name.startswith(".")}
+    return {path.name[0] for path in (store.root / "average").iterdir() if not path.name.startswith(".")}
 
 
 def test_nothing_is_deleted_unasked_and_what_runs_were_made_from_is_kept(used_store, capsys):
@@ -212,8 +219,8 @@ def test_nothing_is_deleted_unasked_and_what_runs_were_made_from_is_kept(used_st
 
 def test_a_store_is_verified_and_what_is_damaged_is_named(used_store, capsys):
     assert "4 products" in output_of(capsys, "store", "--verify")
-    (used_store.folder("average", "a") / "data.bin").write_bytes(b"y" * 1000)
-    (used_store.folder("average", "b") / "product.json").unlink()
+    (used_store.folder("average", key_of("a")) / "data.bin").write_bytes(b"y" * 1000)
+    (used_store.folder("average", key_of("b")) / "product.json").unlink()
     (used_store.root / "average" / ".building-e-1").mkdir()
     for deleted in ("damaged", "deleted"):
         options = ["--delete"] if deleted == "deleted" else []
@@ -225,10 +232,32 @@ def test_a_store_is_verified_and_what_is_damaged_is_named(used_store, capsys):
     assert "2 products" in output_of(capsys, "store", "--verify")
 
 
+@pytest.mark.parametrize("place", ["average/notes", "my.folder/of.mine", f"average/{key_of('e')}", "mine/product.json"])
+def test_what_is_no_product_is_never_deleted(used_store, capsys, place):
+    precious = used_store.root / place / "precious.txt"
+    precious.parent.mkdir(parents=True)
+    precious.write_text("mine")
+    assert "4 products" in output_of(capsys, "store", "--verify", "--delete")
+    assert precious.read_text() == "mine"
+    # Runs, in place of a store.
+    (used_store.root.parent / "runs" / "mine-1234" / "figures").mkdir()
+    assert "0 products" in output_of(capsys, "store", "runs", "--verify", "--delete")
+    assert (used_store.root.parent / "runs" / "mine-1234" / "figures").is_dir()
+
+
 def test_runs_are_listed(used_store, capsys):
     listed = output_of(capsys, "runs")
     assert "mine-1234" in listed
     assert str(datetime.now(UTC).year) in listed
+
+
+def test_a_path_is_written_as_yaml_reads_it(here, capsys):
+    import hera_qm
+
+    data = Path(hera_qm.__file__).parent / "data" / "zen.2457698.40355.xx.HH.uvh5"
+    (here / "a's #1.uvh5").symlink_to(data)
+    output_of(capsys, "init", "mine", "--data", "a's #1.uvh5")
+    assert parse_yaml((here / "mine.yaml").read_text(), "mine")["observed"]["data"] == "a's #1.uvh5"
 
 
 def test_a_file_about_measured_data_is_valid_and_names_their_band(here, capsys, schema):

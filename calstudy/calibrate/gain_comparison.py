@@ -36,6 +36,8 @@ NOT_PARALLEL = 0.3
 """Minimum sine of the angle between two baselines that span the plane."""
 SAME_DELAY = 1e-3
 """Relative difference of delays up to which two errors leave out the same gains."""
+MOST_GRID = 100
+"""Channels of a grid for each channel of the gains, above which their spacing is taken for an error."""
 FEWEST_REALIZATIONS = 10
 """From which errors are known well enough for chi^2."""
 
@@ -214,7 +216,8 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
 
     With `redundant`, one amplitude and one phase gradient across the array in every channel are removed as well, which
     the redundancy of an array does not determine. On a lattice a gradient may be of any number of turns per baseline,
-    elsewhere it must be less than half a turn per baseline. Raises InputError if the two have no gains in common.
+    elsewhere it must be less than half a turn per baseline. Raises InputError if the two have no gains in common, or
+    fewer than two channels, or such as are no part of equally spaced ones.
     """
     if not pair.first.any():
         raise InputError("all gains that the two files have in common are flagged in either")
@@ -226,9 +229,9 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
     aligned = np.zeros_like(first)
     aligned[solved] = aligned_gains(first[solved], pair.second[solved])
     difference = aligned - pair.second
-    width = channel_width(pair.frequency)
+    grid, place = _even_grid(pair.frequency)
     power = [
-        np.mean(np.abs(delay_transform(values, pair.frequency, TAPER)) ** 2, axis=(0, 1))
+        np.mean(np.abs(delay_transform(_with_gaps(values, place, grid.size), grid, TAPER)) ** 2, axis=(0, 1))
         for values in (difference, pair.second)
     ]
     return GainDifference(
@@ -236,10 +239,32 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         as_given=float(_relative(pair.first - pair.second, pair.second, (0, 1, 2))),
         of_antenna=_relative(difference, pair.second, (0, 2)),
         of_channel=_relative(difference, pair.second, (0, 1)),
-        delay=delays(pair.frequency.size, width),
+        delay=delays(grid.size, channel_width(grid)),
         of_delay=np.sqrt(power[0] / power[1]),
         pulls=None if pair.errors is None else _pulls(replace(pair, first=aligned), pair.errors),
     )
+
+
+def _even_grid(frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return equally spaced channels that contain the given ones, and the place of each; raises InputError if none do.
+
+    Files that lack channels have gaps, and so have the channels that two files have in common.
+    """
+    if frequency.size < 2:
+        raise InputError("the two files have one channel in common; their comparison by delay needs two or more")
+    width = np.diff(frequency).min()
+    steps = (frequency - frequency[0]) / width
+    place = np.rint(steps).astype(int)
+    if np.abs(steps - place).max() > SAME_CHANNEL or place[-1] >= MOST_GRID * frequency.size:
+        raise InputError("the channels of the two files are no part of equally spaced ones; average or select them")
+    return np.linspace(frequency[0], frequency[-1], place[-1] + 1), place
+
+
+def _with_gaps(values: np.ndarray, place: np.ndarray, size: int) -> np.ndarray:
+    """Return gains with zeros in the channels that are lacking."""
+    found = np.zeros((*values.shape[:-1], size), values.dtype)
+    found[..., place] = values
+    return found
 
 
 def _pulls(pair: GainPair, errors: np.ndarray) -> np.ndarray | None:

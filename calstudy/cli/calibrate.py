@@ -283,7 +283,12 @@ Folder = Annotated[Path, typer.Option("--output", help="Folder for figure, array
 
 
 def compare_gains(
-    first: First, second: Second, redundant: OnlyRedundant = False, feed: Feed = 0, folder: Folder = Path("checks")
+    first: First,
+    second: Second,
+    redundant: OnlyRedundant = False,
+    feed: Feed = 0,
+    folder: Folder = Path("checks"),
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare two files of gains by antenna, channel and delay.
 
@@ -297,7 +302,11 @@ def compare_gains(
     from calstudy.plotting import style
     from calstudy.plotting.style import figure_arrays, save_figure
     from calstudy.products.files import quiet_libraries
+    from calstudy.run.store import require_writable
 
+    if (folder / f"{NAME}.json").exists() and not overwrite:
+        raise InputError(f"--output {folder}: holds {NAME}.json already; use --overwrite or another folder")
+    require_writable(folder.absolute(), f"--output {folder}")
     with quiet_libraries():
         files = read_gain_pair(first, second)
         common = at_common_channels(*files)

@@ -228,6 +228,8 @@ def fields(
     from calstudy.studies.reference import field_reference, plugin_reference, section_reference
 
     if schema is not None:
+        if section is not None:
+            raise InputError(f"fields {section} --schema: the schema is of whole files; leave out the section")
         write_schema(schema)
     elif section is None:
         typer.echo(field_reference(), nl=False)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -18,6 +19,8 @@ from calstudy.base.errors import InputError
 
 MODELINE = "# yaml-language-server: $schema="
 """Start of the line from which editors know the schema of a file."""
+PLAIN_PATH = re.compile(r"[A-Za-z./][\w./-]*\.[A-Za-z]\w*")
+"""Paths that YAML reads as they are, without quotes."""
 SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: factor, unit: 1 Jy}"
 
 Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.yaml.")]
@@ -86,7 +89,7 @@ def _described(data: str) -> dict[str, Any]:
         raise InputError(f"--data: {error}") from None
     first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
     return {
-        "path": data,
+        "path": data if PLAIN_PATH.fullmatch(data) else json.dumps(data, ensure_ascii=False),
         "summary": f"{facts.antennas} antennas with baselines of up to {facts.frame.lengths.max():.0f} m, "
         f"{facts.frequencies.size} channels between {first / 1e3:.3f} and {last / 1e3:.3f} MHz, {facts.times.size} "
         f"integrations, in {facts.unit!r}.",
@@ -98,14 +101,16 @@ def _described(data: str) -> dict[str, Any]:
 
 
 def write_schema(path: Path) -> None:
-    """Write the JSON schema of experiment files; raises InputError if the file cannot be written.
+    """Write the JSON schema of experiment files; raises InputError if it cannot be, or would replace another file.
 
     An editor with the YAML language server reads it if the first line of a file is
     `# yaml-language-server: $schema=FILE`; files of `calstudy init` have this line.
     """
-    from calstudy.studies.reference import experiment_schema
+    from calstudy.studies.reference import SCHEMA_TITLE, experiment_schema
 
     try:
+        if path.exists() and SCHEMA_TITLE not in path.read_text(encoding="utf-8", errors="replace"):
+            raise InputError(f"--schema {path}: is another file, and is not overwritten; choose another name")
         path.write_text(experiment_schema(), encoding="utf-8")
     except OSError as error:
         raise InputError(f"--schema {path}: cannot be written ({error.strerror})") from None

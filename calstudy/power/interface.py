@@ -64,8 +64,9 @@ def estimate_spectra(
 ) -> DelaySpectra:
     """Return the delay spectra of even times odd by the estimator of the settings, checked.
 
-    The data are as for `Estimator.estimate`, but of one integration or several, whose powers are averaged. Integrations
-    that are completely flagged in either are left out, and so are baselines that are completely flagged in another one.
+    The data are as for `Estimator.estimate`, but of one integration or several, whose powers are averaged.
+    Polarizations and integrations that are completely flagged in either are left out, and so are baselines that are
+    completely flagged in another integration.
     The estimator may write files into `folder`, or nowhere if it is None; with several integrations each has its own
     folder, `block-1` and so on.
 
@@ -77,6 +78,9 @@ def estimate_spectra(
     """
     estimator = cast(Estimator, settings.estimator)
     found = []
+    if without := polarizations_without_data(even, odd):
+        kept = [int(pol) for pol in even.polarization_array if pol not in without]
+        even, odd = (uvd.select(polarizations=kept, inplace=False) for uvd in (even, odd))
     blocks = _blocks(even, odd)
     for number, (first, second) in enumerate(blocks, 1):
         place = folder
@@ -96,6 +100,12 @@ def estimate_spectra(
     sidereal_times = np.array([first.lst_array[0] for first, _ in blocks])
     latitude = float(even.telescope.location.lat.rad)
     return average_times(found, independent_times(sidereal_times, latitude, found[0].omega_pp))
+
+
+def polarizations_without_data(even: UVData, odd: UVData) -> list[int]:
+    """Return the polarizations that are completely flagged in either data set; empty if there are no others."""
+    flagged = np.any([uvd.flag_array.all(axis=(0, 1)) for uvd in (even, odd)], axis=0)
+    return [] if flagged.all() else [int(pol) for pol in even.polarization_array[flagged]]
 
 
 def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:

@@ -335,7 +335,8 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
     """Return the transfer function of several injections together, such as EoR skies of different seeds.
 
     Each enters with its signal's power, as if its modes were further modes of one injection, and errors add up as those
-    of independent skies. Raise ValueError if there is none, or if their bins differ.
+    of independent skies. A number that is NaN in some of them is that of the others. Raise ValueError if there is none,
+    or if their bins differ.
     """
     if not transfers:
         raise ValueError("no transfer function to pool, expected at least one")
@@ -343,28 +344,22 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
     if any(not np.array_equal(other.bin_edges, first.bin_edges) for other in transfers):
         raise ValueError("the transfer functions have different bins, expected the same")
     signal = np.stack([item.signal for item in transfers])
-    total = _sum_present(signal)
-    weights = signal / total
-
-    def mean(name: str) -> np.ndarray:
-        return _sum_present(weights * np.stack([getattr(item, name) for item in transfers]))
-
-    def error(name: str) -> np.ndarray:
-        return np.sqrt(_sum_present((weights * np.stack([getattr(item, name) for item in transfers])) ** 2))
-
+    found: dict[str, np.ndarray] = {}
+    for name in ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence"):
+        values, errors = (np.stack([getattr(item, key) for item in transfers]) for key in (name, f"{name}_error"))
+        weights = np.where(np.isfinite(values), signal, 0.0)
+        weights = np.divide(weights, weights.sum(axis=0), out=np.full(weights.shape, np.nan), where=weights > 0)
+        found[name] = _sum_present(weights * values)
+        # Not known if that of one of the skies is not.
+        unknown = (weights > 0) & ~np.isfinite(errors)
+        found[f"{name}_error"] = np.where(unknown.any(axis=0), np.nan, np.sqrt(_sum_present((weights * errors) ** 2)))
+    scales = [item.flux_scale for item in transfers if np.isfinite(item.flux_scale)]
     return replace(
         first,
-        transfer=mean("transfer"),
-        transfer_error=error("transfer_error"),
-        cross_transfer=mean("cross_transfer"),
-        cross_transfer_error=error("cross_transfer_error"),
-        scale_free_transfer=mean("scale_free_transfer"),
-        scale_free_transfer_error=error("scale_free_transfer_error"),
-        squared_coherence=mean("squared_coherence"),
-        squared_coherence_error=error("squared_coherence_error"),
-        signal=total,
+        **found,
+        signal=_sum_present(signal),
         n_samples=np.sum([item.n_samples for item in transfers], axis=0),
-        flux_scale=float(np.mean([item.flux_scale for item in transfers])),
+        flux_scale=float(np.mean(scales)) if scales else np.nan,
     )
 
 

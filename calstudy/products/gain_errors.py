@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -172,6 +172,8 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         used = self.realizations if all(reasons) and RAN_AWAY not in reasons else 0
         if used:
             errors = GainRealizations(self.calibrator, *self.read(), result, self.realizations).errors()
+            # Gains that are given, and not fitted.
+            errors[..., ~(errors > 0).any(axis=(0, 1, 2))] = np.nan
             records = [self._by_realizations(result, errors, solve) for solve in result.solutions]
         result.gains.write_calh5(output / GAINS)
         if np.isfinite(errors).any():
@@ -194,6 +196,9 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         """Return the record of a solve whose errors are from realizations."""
         place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
         at = (slice(None), slice(None), solve.integration, place)
+        if not np.isfinite(errors[0][at]).any():
+            flagged = result.gains.flag_array[at].all()
+            return {"reason": "all gains are flagged" if flagged else "gains do not change with the noise of the data"}
         relative = float(np.nanmedian(errors[0][at] / np.abs(result.gains.gain_array[at])))
         return {
             "median_relative_amplitude": relative,
@@ -205,8 +210,12 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
         }
 
     def _cost(self) -> Cost:
-        own, again = super()._cost(), cost_of(self.calibrator, size_of(self))
-        return Cost(own.seconds + self.realizations * again.seconds, max(own.memory, again.memory), own.disk)
+        own, size = super()._cost(), size_of(self)
+        twice = replace(size, polarizations=2 * size.polarizations)
+        one, two = (cost_of(self.calibrator, of) for of in (size, twice))
+        # Libraries are loaded once, which costs the same for twice the data.
+        seconds = own.seconds + self.realizations * (two.seconds - one.seconds)
+        return Cost(seconds, max(own.memory, one.memory), own.disk)
 
 
 def lost_antennas(records: Sequence[Mapping[str, Any]]) -> list[str]:

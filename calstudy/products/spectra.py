@@ -13,7 +13,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
 from calstudy.power.binned import cylindrical_average, noise_level, spherical_average, with_errors
-from calstudy.power.interface import estimate_spectra
+from calstudy.power.interface import estimate_spectra, polarizations_without_data
 from calstudy.power.spectra import DelaySpectra
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
@@ -163,7 +163,9 @@ class Power(Task, stage="power", version=4):
         if empty:
             found = replace(found, power=np.full_like(found.power, np.nan))
         save_spectrum(output / DELAY_SPECTRA, found)
-        return {"units": len(found.n_pairs), "pairs": int(found.n_pairs.sum())}
+        without = polarizations_without_data(even, odd)
+        warnings = {"warnings": [f"{len(without)} polarization(s) without data are left out"]} if without else {}
+        return {"units": len(found.n_pairs), "pairs": int(found.n_pairs.sum()), **warnings}
 
     def _cost(self) -> Cost:
         # Differences and noise are made from averages.

@@ -37,7 +37,7 @@ class Facts:
 
     `frame` has antennas, baselines (autocorrelations among them) and channels, ascending. `times` (Julian dates) and
     `sidereal_times` (rad) are (Ntimes,); `integration` is the duration of the shortest one, s. `autos` is true if there
-    are autocorrelations of all antennas.
+    are autocorrelations of all antennas. `polarizations` are those of parallel hands, as pyuvdata numbers them.
     """
 
     unit: str
@@ -46,6 +46,7 @@ class Facts:
     sidereal_times: np.ndarray
     integration: float
     autos: bool
+    polarizations: tuple[int, ...]
 
     @property
     def duration(self) -> float:
@@ -174,6 +175,7 @@ def read_facts(
     times, rows = np.unique(data.time_array, return_index=True)
     places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     numbers = np.unique(pairs)
+    parallel = [int(number) for number in data.polarization_array if number in PARALLEL_HANDS]
     return Facts(
         unit=str(data.vis_units),
         frame=Frame(
@@ -182,12 +184,13 @@ def read_facts(
             np.searchsorted(numbers, pairs),
             frequencies,
             times.size,
-            int(np.isin(data.polarization_array, list(PARALLEL_HANDS)).sum()),
+            len(parallel),
         ),
         times=times,
         sidereal_times=np.asarray(data.lst_array)[rows],
         integration=float(np.min(data.integration_time)),
         autos=set(np.unique(crosses).tolist()) <= set(autos.tolist()),
+        polarizations=tuple(parallel),
     )
 
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.resources import Usage, cores
 from calstudy.base.schema import plain
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
@@ -39,7 +40,7 @@ SPARE = 10e6
 class WorkOrder:
     """A task without the tasks behind it, as sent to a worker, and what the one who sends it would make it with.
 
-    `disk` is the estimated size of the product in bytes.
+    `content` is the identity of its settings in the plan, `disk` the estimated size of the product in bytes.
     """
 
     task: Task
@@ -48,6 +49,7 @@ class WorkOrder:
     store: Path
     again: bool
     made_with: Mapping[str, Any]
+    content: Any
     disk: float
 
     @classmethod
@@ -56,9 +58,8 @@ class WorkOrder:
         own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
         bare = task.given({name: name for name in inputs})
-        return cls(
-            task=bare, key=task.key, inputs=inputs, store=store.root, again=again, made_with=own, disk=task.cost.disk
-        )
+        known = {"key": task.key, "content": task.content, "made_with": own, "disk": task.cost.disk}
+        return cls(task=bare, inputs=inputs, store=store.root, again=again, **known)
 
     @property
     def name(self) -> str:
@@ -156,6 +157,7 @@ def _make(order: WorkOrder, store: Store) -> Product:
     with store.building(task.stage.name, order.key) as folder:
         with Usage() as usage:
             notes = task.given({name: product.path for name, product in inputs.items()}).make(folder)
+        _require_unchanged(order)
         own = made_with(task)
         record = {
             "stage": task.stage.name,
@@ -178,6 +180,19 @@ def _make(order: WorkOrder, store: Store) -> Product:
             "peak_memory_bytes": usage.peak_memory,
         }
         return store.seal(folder, record)
+
+
+def _require_unchanged(order: WorkOrder) -> None:
+    """Raise InputError if a file that was read is not the one of the plan, which the product's key names."""
+    try:
+        unchanged = identity(order.task.settings) == order.content
+    except FileNotFoundError:
+        unchanged = False
+    if not unchanged:
+        raise InputError(
+            f"{order.name}: a file that it reads was changed or removed while the run was going on; run again when the "
+            "file is complete"
+        )
 
 
 BEGUN, WAITS = "begun", "waits"

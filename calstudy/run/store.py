@@ -42,6 +42,8 @@ SILENT_WAIT, LONGEST_WAIT = 5.0, 24 * 3600.0
 """Seconds after which a wait for a lock is reported, and after which it ends."""
 PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Stages and keys: names of folders, without separators or dots."""
+KEY = re.compile(r"[0-9a-f]{32}")
+"""Keys of products."""
 
 
 @dataclass(frozen=True)
@@ -146,9 +148,19 @@ class Store:
             return False  # A name that no file can have, or a folder that may not be read.
 
     def addresses(self) -> list[tuple[str, str]]:
-        """Return stage and key of every product in the store, intact or damaged."""
+        """Return stage and key of every product in the store, intact or damaged.
+
+        Other folders are not listed, because what is damaged may be deleted: a product has the name of a key, and a
+        record or the file of its lock.
+        """
         found = (path for path in sorted(self.root.glob("[!.]*/[!.]*")) if path.is_dir())
-        return [(path.parent.name, path.name) for path in found]
+        named = [(path.parent.name, path.name) for path in found if KEY.fullmatch(path.name)]
+        return [
+            (stage, key)
+            for stage, key in named
+            if PLAIN.fullmatch(stage)
+            and ((self.root / stage / key / RECORD).exists() or self._lock_file(stage, key).exists())
+        ]
 
     def discard(self, stage: str, key: str) -> None:
         """Remove a product, if it exists; its name disappears at once."""

@@ -133,11 +133,16 @@ class Task(Declared, ABC):
         return {**self.inputs, **self.pieces}
 
     @cached_property
+    def content(self) -> Any:
+        """The identity of the settings, with that of the content of files that they name."""
+        return identity(self.settings)
+
+    @cached_property
     def key(self) -> str:
         """The content address: a digest of stage, version, settings, the inputs' keys, and the stages of the pieces."""
         inputs = {name: task.key for name, task in self.inputs.items()}
         stages = sorted({task.stage for task in unique(self.pieces.values())})
-        own = [*self.stage, identity(self.settings), inputs]
+        own = [*self.stage, self.content, inputs]
         return digest_json([*own, stages] if stages else own)
 
     def given(self, needed: Mapping[str, Any]) -> Self:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar
 
+from filelock import FileLock, Timeout
 from pydantic import Field, SerializeAsAny, model_validator
 from rich.console import Console
 
@@ -53,9 +55,11 @@ from calstudy.studies.capacity import fit
 from calstudy.studies.folder import LOG, log_to, publish
 from calstudy.studies.study import RunProducts, Study, make
 
-FIGURE, UNFINISHED = "diagnostics", ".unfinished"
+FIGURE, UNFINISHED, IN_USE = "diagnostics", ".unfinished", ".calibrating"
 GainFormat = Literal["calfits", "h5parm", "hyperdrive", "mwaocal"]
-SUFFIXES = {"h5parm": ".h5", "hyperdrive": ".fits", "mwaocal": ".bin"}
+SUFFIXES = {"calfits": ".calfits", "h5parm": ".h5", "hyperdrive": ".fits", "mwaocal": ".bin"}
+LINEAR = {-5, -6}
+"""Polarizations xx and yy, as pyuvdata numbers them."""
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
 
 
@@ -186,9 +190,9 @@ class DataCalibration(DataStudy):
             label = content.calibration.label
             raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
         facts = read_selected(content, content.observed.data, even=False)
-        if {"hyperdrive", "mwaocal"} & set(content.also) and facts.frame.n_polarizations != 2:
+        if {"hyperdrive", "mwaocal"} & set(content.also) and set(facts.polarizations) != LINEAR:
             raise InputError(
-                "also: hyperdrive and mwaocal hold gains of xx and yy, and the data have one; take calfits or h5parm"
+                "also: hyperdrive and mwaocal hold gains of xx and yy, and the data have others; take calfits or h5parm"
             )
         return cls(content, Parts({WHOLE: facts}))
 
@@ -245,14 +249,15 @@ class DataCalibration(DataStudy):
         """Calibrate, write the results to the folder, and return the content of solution.json.
 
         The products are kept in a hidden folder until the results are written, so that another run resumes. Raises
-        InputError if a stage refuses its input, or the folder cannot be written.
+        InputError if a stage refuses its input, or the folder cannot be written or is in use.
         """
         store = Store(self.outputs.store)
         store.prepare()
-        with log_to(store.root / LOG):
-            made = make(self.targets, store, Workers(1, store.root / LOG), console)
-            solution = self._write(made)
-        shutil.rmtree(store.root, ignore_errors=True)
+        with _alone(self.outputs.runs):
+            with log_to(store.root / LOG):
+                made = make(self.targets, store, Workers(1, store.root / LOG), console)
+                solution = self._write(made)
+            shutil.rmtree(store.root, ignore_errors=True)
         return solution
 
     def _write(self, made: RunProducts) -> dict[str, Any]:
@@ -271,6 +276,9 @@ class DataCalibration(DataStudy):
                 flag_unsolved(work)
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
             self._write_gains_also(work)
+            # Those of an earlier calibration that may be replaced.
+            for name in set(results_in(folder)) - {path.name for path in work.iterdir()}:
+                (folder / name).unlink()
             for path in work.iterdir():
                 path.replace(folder / path.name)
         return solution
@@ -282,10 +290,11 @@ class DataCalibration(DataStudy):
         if self.file.also:
             gains = UVCal.from_file(work / GAINS)
         for kind in self.file.also:
+            path = (work / GAINS).with_suffix(SUFFIXES[kind])
             if kind == "calfits":
-                gains.write_calfits(str((work / GAINS).with_suffix(".calfits")))
+                gains.write_calfits(str(path))
             else:
-                write_gains(gains, (work / GAINS).with_suffix(SUFFIXES[kind]))
+                write_gains(gains, path)
 
     def _solution(self, made: RunProducts, solved: Mapping[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         """Return the request, the changes of the data, what stands out, and every solve, as plain JSON types."""
@@ -337,10 +346,32 @@ def require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
     if output.exists() and not output.is_dir():
         raise InputError(f"output = {output}: is a file, not a folder")
-    gains = (str(Path(GAINS).with_suffix(f".{suffix}")) for suffix in get_args(GainFormat))
-    names = (GAINS, *gains, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
-    present = [name for name in names if (output / name).exists()]
-    present += [path.name for path in sorted(output.glob(f"{EXPECTED_TRANSFER}.*.h5"))]
-    if present and not overwrite:
+    if (present := results_in(output)) and not overwrite:
         raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
     require_writable(output.absolute(), f"output = {output}")
+
+
+def results_in(folder: Path) -> list[str]:
+    """Return the names of the results of a calibration that are in a folder."""
+    gains = (str(Path(GAINS).with_suffix(suffix)) for suffix in SUFFIXES.values())
+    names = (GAINS, *gains, MODEL, RESIDUAL, SOLUTION, *FIGURE_FILES)
+    found = [name for name in names if (folder / name).exists()]
+    return found + [path.name for path in sorted(folder.glob(f"{EXPECTED_TRANSFER}.*.h5"))]
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold a folder of results within the block; raises InputError if another calibration does."""
+    path = folder / IN_USE
+    lock = FileLock(path, fallback_to_soft=False)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(
+            f"output = {folder}: another calibration writes to it; wait for its end, or take another folder"
+        ) from None
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        lock.release()

@@ -211,6 +211,7 @@ def field_reference() -> str:
 SCHEMA_FILE = "experiment.schema.json"
 """Name of the published schema, next to the experiments."""
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
+SCHEMA_TITLE = "calstudy experiment"
 
 
 def experiment_schema() -> str:
@@ -225,7 +226,7 @@ def experiment_schema() -> str:
     for model, key in kinds.items():
         schema = {"if": {"required": [key]}, "then": references[model, "validation"], "else": schema}
     definitions = {name: _plain(block) for name, block in found["$defs"].items()}
-    whole = {"$schema": DIALECT, "title": "calstudy experiment", "type": "object", **schema, "$defs": definitions}
+    whole = {"$schema": DIALECT, "title": SCHEMA_TITLE, "type": "object", **schema, "$defs": definitions}
     return json.dumps(whole, indent=1, sort_keys=True) + "\n"
 
 

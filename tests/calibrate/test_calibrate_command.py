@@ -12,6 +12,7 @@ from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from pyuvdata import UVCal, UVData
 from toy_data import make_uvdata
 
@@ -23,7 +24,7 @@ from calstudy.cli import main as cli
 from calstudy.interface import CalibratedData
 from calstudy.power.tables import load_spectrum
 from calstudy.realdata.settings import defaults
-from calstudy.studies.calibration import FIGURE_FILES
+from calstudy.studies.calibration import FIGURE_FILES, IN_USE
 
 WRITTEN = {"gains.calh5", "model.uvh5", "residual.uvh5", "solution.json", *FIGURE_FILES}
 """Without options."""
@@ -179,6 +180,32 @@ def test_results_are_never_overwritten_unasked(command, data, tmp_path):
     assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
     assert {path.name for path in folder.iterdir()} == WRITTEN
     assert UVCal.from_file(str(folder / "gains.calh5")).Ntimes == 2
+
+
+@pytest.mark.parametrize("name", ["gains.h5", "gains.fits", "gains.bin", "gains.calfits"])
+def test_gains_of_other_formats_are_not_overwritten_either(command, data, tmp_path, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("precious")
+    code, error = command(data, *OPTIONS, "--output", "out", "--also", "h5parm")
+    assert (code, (tmp_path / "out" / name).read_text()) == (2, "precious")
+    assert f"holds {name} already" in error
+
+
+def test_results_that_are_replaced_leave_none_of_the_earlier_calibration(command, data, finished, tmp_path):
+    shutil.copytree(finished[0] / "out", tmp_path / "out")
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt"}
+
+
+def test_two_calibrations_do_not_write_to_one_folder(command, data, tmp_path):
+    (tmp_path / "out").mkdir()
+    with FileLock(tmp_path / "out" / IN_USE, fallback_to_soft=False):
+        code, error = command(data, *OPTIONS, "--output", "out")
+        assert code == 2
+        assert "--output out: another calibration writes to it" in error
+    assert command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")[0] == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN
 
 
 def test_not_converging_is_exit_code_3_and_says_which(command, data):

@@ -81,9 +81,9 @@ def test_only_common_channels_are_compared(template, gains, tmp_path, capsys):
     part.write_calh5(tmp_path / "part.calh5")
     for files in (("all", "part"), ("part", "all")):
         paths = [tmp_path / f"{name}.calh5" for name in files]
-        status, told = run_command(capsys, "compare-gains", *paths, "--output", tmp_path / "out")
+        status, told = run_command(capsys, "compare-gains", *paths, "--output", tmp_path / files[0])
         assert status == 0, told
-        numbers = json.loads((tmp_path / "out" / "gain-comparison.json").read_text())
+        numbers = json.loads((tmp_path / files[0] / "gain-comparison.json").read_text())
         assert numbers["channels"] == 32
         # Doubles agree to rounding.
         assert numbers["difference"] < 1e-12
@@ -93,6 +93,37 @@ def test_only_common_channels_are_compared(template, gains, tmp_path, capsys):
     status, told = run_command(capsys, "compare-gains", tmp_path / "all.calh5", tmp_path / "other.calh5")
     assert status == 2
     assert "the two files have no channel in common" in told
+
+
+def test_gains_with_gaps_are_compared_by_delay(template, gains):
+    changed = gains.copy()
+    changed[4, :, :, 0] *= 1 + 0.01 * np.exp(2j * np.pi * 600e-9 * FREQUENCIES)[:, None]
+    kept = np.delete(np.arange(FREQUENCIES.size), [11, 20, 21])
+    one, other = (make_uvcal(template, values).select(freq_chans=kept, inplace=False) for values in (changed, gains))
+    found = compare_gains(pair_gains(one, other))
+    assert found.of_channel.size == kept.size
+    assert found.delay.size == FREQUENCIES.size
+    assert abs(found.delay[found.of_delay.argmax()]) == pytest.approx(600e-9, abs=100e-9)
+    with pytest.raises(InputError, match="one channel in common"):
+        compare_gains(pair_gains(*(cal.select(freq_chans=[3], inplace=False) for cal in (one, other))))
+    for cal in (one, other):
+        cal.freq_array[5] += 0.3 * np.diff(FREQUENCIES)[0]
+    with pytest.raises(InputError, match="no part of equally spaced ones"):
+        compare_gains(pair_gains(one, other))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_comparison_is_not_overwritten_unasked(template, gains, tmp_path, capsys):
+    make_uvcal(template, gains).write_calh5(tmp_path / "a.calh5")
+    command = ("compare-gains", tmp_path / "a.calh5", tmp_path / "a.calh5", "--output")
+    assert run_command(capsys, *command, tmp_path / "out")[0] == 0
+    status, told = run_command(capsys, *command, tmp_path / "out")
+    assert status == 2
+    assert "holds gain-comparison.json already; use --overwrite or another folder" in told
+    assert run_command(capsys, *command, tmp_path / "out", "--overwrite")[0] == 0
+    status, told = run_command(capsys, *command, tmp_path / "a.calh5")
+    assert status == 2
+    assert "cannot be written" in told
 
 
 def test_an_error_is_found_where_it_is(template, gains):
@@ -199,7 +230,7 @@ def test_errors_of_realizations_have_a_distribution_of_their_own_and_few_tell_no
     for count, expected in ((0, "68.3 and 95.0"), (10, "67.6 and 94.2")):
         # One of two errors is exact, and four times nine degrees of freedom are left.
         second = with_errors(template, tmp_path / f"{count}.calh5", two, size, realizations=count)
-        status, told = run_command(capsys, "compare-gains", first, second, "--output", tmp_path / "out")
+        status, told = run_command(capsys, "compare-gains", first, second, "--output", tmp_path / "out", "--overwrite")
         assert status == 0, told
         numbers = json.loads((tmp_path / "out" / "gain-comparison.json").read_text())
         assert f"({expected} % if" in numbers["amplitudes within 1 and 1.96 errors"]
@@ -211,7 +242,7 @@ def test_errors_of_realizations_have_a_distribution_of_their_own_and_few_tell_no
         ("smooth", {"smooth_delay": 3e-7}, "up to 0 and 300 ns"),
     ):
         second = with_errors(template, tmp_path / f"{name}.calh5", two, size, **changes)
-        status, told = run_command(capsys, "compare-gains", first, second, "--output", tmp_path / "out")
+        status, told = run_command(capsys, "compare-gains", first, second, "--output", tmp_path / "out", "--overwrite")
         assert status == 0, told
         assert reason in told
         assert "chi-squared" not in (tmp_path / "out" / "gain-comparison.json").read_text()

@@ -8,6 +8,7 @@ from toy import FREQUENCIES, LARGE_HEX, make_toy, scattered
 from toy_data import errors, make_uvdata, sky_of
 
 import calstudy
+from calstudy.base.errors import InputError
 from calstudy.base.visibilities import flag_cube
 from calstudy.calibrate.calibrators.least_squares import SkyBased
 from calstudy.calibrate.calibrators.other_packages import Skycal
@@ -67,19 +68,42 @@ def test_errors_of_calibrators_of_other_packages_cover(calibrator, positions):
         assert np.mean(pulls < 1.96) == pytest.approx(0.931, abs=0.03)
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_gains_of_measured_data_have_them_if_asked_for(noisy, tmp_path):
-    uvd = make_uvdata(noisy, n_times=2)
-    uvd.write_uvh5(tmp_path / "data.uvh5")
-    sky_of(uvd, noisy.foregrounds).write_uvh5(tmp_path / "sky.uvh5")
-    observed = {"sky_model": str(tmp_path / "sky.uvh5")}
-    settings = {"calibrator": "skycal", "weights": "flags"}
+@pytest.fixture
+def calibrated(noisy, tmp_path):
+    """Calibrate two integrations by skycal, of which some may be flagged, to a folder of a name."""
 
-    def calibrated(name, gain_errors):
+    def calibrate(name, gain_errors, flagged=slice(0), **settings):
+        uvd = make_uvdata(noisy, n_times=2)
+        sky_of(uvd, noisy.foregrounds).write_uvh5(tmp_path / "sky.uvh5", clobber=True)
+        times = np.unique(uvd.time_array)[flagged]
+        uvd.flag_array[np.isin(uvd.time_array, times)] = True
+        uvd.write_uvh5(tmp_path / "data.uvh5", clobber=True)
+        settings = settings or {"calibrator": "skycal", "weights": "flags"}
+        observed = {"sky_model": str(tmp_path / "sky.uvh5")}
         return calstudy.calibrate_data(
             tmp_path / "data.uvh5", tmp_path / name, observed, quiet=True, gain_errors=gain_errors, **settings
         )
 
+    return calibrate
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_integrations_without_data_and_gains_that_are_given_have_none_and_say_so(calibrated, tmp_path):
+    found = calibrated("flagged", 2, flagged=slice(1, 2))
+    first, second = (record["gain_errors"] for record in found.solution["records"])
+    assert first["realizations"] == 2
+    assert second == {"reason": "all gains are flagged"}
+    gains = str(tmp_path / "flagged" / "gains.calh5")
+    given = calibrated("given", 2, calibrator="by-file", gains=gains)
+    assert {record["gain_errors"]["reason"] for record in given.solution["records"]} >= {
+        "gains do not change with the noise of the data"
+    }
+    with pytest.raises(InputError, match="has no errors of gains"):
+        _ = given.gain_errors
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_gains_of_measured_data_have_them_if_asked_for(calibrated):
     found = calibrated("with", 3)
     assert np.array_equal(np.isfinite(found.gain_errors.amplitude), ~found.gains.flag_array)
     for record in found.solution["records"]:

@@ -14,6 +14,7 @@ from calstudy.power import cosmology as c
 from calstudy.power.binned import spherical_average
 from calstudy.power.delay import delay_transform, delays, make_taper
 from calstudy.power.estimate import DiagonalPSpecData, estimate_power, kelvin_per_jansky, make_pairs
+from calstudy.power.interface import estimate_spectra, polarizations_without_data
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import delay_spectra
 
@@ -250,6 +251,21 @@ def test_inputs_are_untouched_and_the_result_survives_hdf5(observe, white, beam,
     power = delay_spectra(uvp, settings).power
     # What is read lies otherwise in memory, and may be added up in another order.
     np.testing.assert_allclose(delay_spectra(back, settings).power, power, rtol=0, atol=1e-12 * np.abs(power).max())
+
+
+def test_a_polarization_without_data_is_left_out(observe, white, beam):
+    even, odd = two(observe(GOLOMB, polarizations=("xx", "yy")), white)
+    first = even.polarization_array[0]
+    alone = estimate_spectra(
+        *(uvd.select(polarizations=[first], inplace=False) for uvd in (even, odd)), beam, PowerSettings()
+    )
+    odd.flag_array[..., 1] = True
+    assert polarizations_without_data(even, odd) == [even.polarization_array[1]]
+    found = estimate_spectra(even, odd, beam, PowerSettings())
+    np.testing.assert_allclose(found.power, alone.power, rtol=1e-10)
+    assert even.Npols == 2
+    even.flag_array[:] = True
+    assert polarizations_without_data(even, odd) == []
 
 
 def test_bad_data_are_refused(observe, white, beam):

@@ -234,6 +234,20 @@ def test_pooling_is_as_if_all_modes_were_of_one_injection(rng):
         pool([])
 
 
+def test_what_is_not_known_of_one_injection_is_that_of_the_others(rng):
+    signals = [noise(rng) for _ in range(3)]
+    injections = [inject(part, 0.8 * part, 0.8 * part) for part in signals]
+    found = [spherical_transfer(item, ONE_BIN, BUFFER, inside=False, flux_scale=1.1) for item in injections]
+    unknown = dataclasses.replace(found[0], scale_free_transfer=np.full(1, np.nan), flux_scale=np.nan)
+    kept, others = pool([unknown, *found[1:]]), pool(found[1:])
+    assert np.isfinite(others.scale_free_transfer).all()
+    assert kept.scale_free_transfer == pytest.approx(others.scale_free_transfer)
+    assert kept.scale_free_transfer_error == pytest.approx(others.scale_free_transfer_error)
+    assert (kept.transfer, kept.flux_scale) == (pytest.approx(pool(found).transfer), others.flux_scale)
+    # An error that is not known is no error of zero.
+    assert np.isnan(pool([dataclasses.replace(found[0], transfer_error=np.full(1, np.nan)), *found[1:]]).transfer_error)
+
+
 def spectrum(power: list[float], error: float, edges: np.ndarray) -> SphericalSpectrum:
     ones = np.ones(len(power))
     return SphericalSpectrum(

@@ -64,6 +64,31 @@ def test_a_product_is_made_from_its_inputs_and_pieces_and_recorded(store):
     assert product.record["stage_version"] == 1
 
 
+class Copied(Task, stage="copied"):
+    """A copy of a file."""
+
+    source: Path
+
+    def make(self, output: Path) -> dict:
+        (output / "copy").write_bytes(self.source.read_bytes())
+        return {}
+
+
+@pytest.mark.parametrize("change", [lambda path: path.write_text("changed"), Path.unlink])
+def test_a_file_that_changes_after_the_plan_gives_no_product(store, tmp_path, change):
+    source = tmp_path / "data"
+    source.write_text("as planned")
+    task = Copied("copy", source=source)
+    order = WorkOrder.of(task, store)
+    change(source)
+    with pytest.raises((InputError, FileNotFoundError)) as found:
+        perform(order)
+    assert isinstance(found.value, FileNotFoundError) or "was changed or removed while the run" in str(found.value)
+    assert store.find("copied", task.key) is None
+    source.write_text("as planned")
+    assert (perform(order).path / "copy").read_text() == "as planned"
+
+
 def test_a_product_of_an_older_version_is_not_found_and_left_alone(store):
     old = Number("total", number=1)
     run(old, store)
