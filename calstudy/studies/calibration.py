@@ -370,6 +370,8 @@ def _alone(folder: Path) -> Iterator[None]:
         raise InputError(
             f"output = {folder}: another calibration writes to it; wait for its end, or take another folder"
         ) from None
+    except OSError as error:
+        raise InputError(f"output = {folder}: cannot be locked ({error.strerror}); take another folder") from None
     try:
         yield
     finally:
