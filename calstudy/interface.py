@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from html import escape
 from io import StringIO
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -30,6 +30,7 @@ from calstudy.base.gains import draw_gains, read_gain_errors
 from calstudy.experiment.files import StudyFile
 from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
+from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     DATA,
     GAINS,
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
     from rich.console import Console
 
-    from calstudy.experiment.model import Experiment, Variant
+    from calstudy.experiment.model import Experiment, Folders, Variant
     from calstudy.power.transfer import TransferFunction
 
 Half = Literal["even", "odd"]
@@ -89,7 +90,7 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
     """
     texts = _overrides(changes)
     if isinstance(source, Mapping):
-        return LoadedStudy(study_of(StudyFile(Path("study.yaml"), source, scale, texts)))
+        return LoadedStudy(study_of(StudyFile(Path("study.yaml"), _plain(source), scale, texts)))
     return LoadedStudy(load_study(Path(source), scale, texts))
 
 
@@ -482,7 +483,7 @@ class OpenRun:
         study = self._experiment
         if self._variant(variant).calibrate:
             return read_visibilities(self._product(self._calibration(variant, half), study) / RESIDUAL)
-        data = corruption.data(study.graph, self._variant(variant), half)
+        data = corruption.data(study.graph, self._variant(variant), _known(half))
         return read_visibilities(self._product(data, study) / DATA)
 
     @property
@@ -500,7 +501,9 @@ class OpenRun:
             )
         task = cast(Draw, tasks[name])
         inputs = {needed: self._product(other, study) for needed, other in task.needs.items()}
-        return task.given(inputs).drawing(self.folder).figure
+        # Some figures also write tables, which are in the folder of the run already.
+        with TemporaryDirectory() as folder:
+            return task.given(inputs).drawing(Path(folder)).figure
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
@@ -558,21 +561,51 @@ class OpenRun:
     def _calibration(self, variant: str, half: Half) -> Task:
         if not self._variant(variant).calibrate:
             raise InputError(f"{variant!r} is not calibrated")
-        return calibration.calibration(self._experiment.graph, self._variant(variant), half)
+        return calibration.calibration(self._experiment.graph, self._variant(variant), _known(half))
 
     def _product(self, task: Task, study: Study) -> Path:
-        store = Store(study.outputs.store)
-        product = store.find(task.stage.name, task.key)
-        if product is None:
-            raise InputError(
-                f"{task.stage.name} ({task.label}): is not in the store {store.root}, or was made by another version; "
-                "run the study again"
-            )
-        return product.path
+        stores = self._stores(study.outputs)
+        for store in stores:
+            if (product := store.find(task.stage.name, task.key)) is not None:
+                return product.path
+        raise InputError(
+            f"{task.stage.name} ({task.label}): is not in the store {stores[-1].root}, or was made by another version; "
+            "run the study again"
+        )
+
+    def _stores(self, outputs: Folders) -> list[Store]:
+        """Return the store from the working directory and, if its path is relative, from where the run was started."""
+        store, runs = Path(outputs.store), Path(outputs.runs)
+        above = self.folder.resolve().parents
+        if store.is_absolute() or runs.is_absolute() or len(above) <= len(runs.parts):
+            return [Store(store)]
+        return [Store(store), Store(above[len(runs.parts)] / store)]
 
 
 def _overrides(changes: Mapping[str, Any], section: str = "") -> list[str]:
-    return [f"{section}{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in changes.items()]
+    plain = _plain(changes)
+    return [f"{section}{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in plain.items()]
+
+
+def _plain(value: Any, path: str = "") -> Any:
+    """Return a value as YAML has it: numbers and arrays of numpy, and paths, as plain ones."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, f"{path}.{key}" if path else str(key)) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item, path) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist(), path)
+    if isinstance(value, PurePath):
+        return str(value)
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    raise InputError(f"{path} = {value!r}: a {type(value).__name__} cannot be in a file; give a number, text or list")
+
+
+def _known(half: str) -> str:
+    if half not in PARITIES:
+        raise InputError(f"half = {half!r}: must be one of {', '.join(PARITIES)}")
+    return half
 
 
 def _single(study: Study) -> ExperimentStudy:

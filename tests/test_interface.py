@@ -45,6 +45,17 @@ def test_changes_are_fields_and_faults_are_reported_together(file):
     assert len(raised.value.faults) == 2
 
 
+def test_numbers_of_numpy_and_paths_are_plain_ones(file, tmp_path):
+    changes = {"instrument.times.count": np.int64(3), "power.wedge_buffer": "250 ns", "outputs.runs": tmp_path}
+    study = calstudy.load(file, **changes)
+    assert (study.experiment.instrument.times.count, study.experiment.outputs.runs) == (3, tmp_path)
+    content = yaml.safe_load(file.read_text())
+    content["instrument"]["times"]["count"] = np.array([3, 4])[0]
+    assert calstudy.load(content).experiment.instrument.times.count == 3
+    with pytest.raises(InputError, match=r"power = .*a object cannot be in a file"):
+        calstudy.load(file, power=object())
+
+
 def test_a_dictionary_is_the_content_of_a_file(file):
     study = calstudy.load(yaml.safe_load(file.read_text()))
     assert study.folder == calstudy.load(file).folder
@@ -117,7 +128,36 @@ def test_figures_are_drawn_again(run):
         run.plot("wedges")
 
 
+def test_a_figure_that_is_drawn_again_leaves_nothing_in_the_folder_of_the_run(run):
+    before = sorted(run.folder.rglob("*"))
+    run.plot("signal-loss")
+    assert sorted(run.folder.rglob("*")) == before
+
+
+def test_the_store_is_found_from_any_working_directory(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(file.parent)
+    run = calstudy.load(file, **{"outputs.store": "store", "outputs.runs": "of/runs"}).run(workers=1, quiet=True)
+    found = calstudy.open_run(run.folder.resolve())
+    monkeypatch.chdir(tmp_path)
+    assert found.gains("true").Nants_data > 1
+    assert not (tmp_path / "store").exists()
+
+
+def test_workers_that_cannot_start_say_what_a_script_must_have(file, monkeypatch):
+    import distributed
+
+    def refuse(**settings):
+        raise RuntimeError("before the current process has finished its bootstrapping phase")
+
+    monkeypatch.setattr(distributed, "LocalCluster", refuse)
+    with pytest.raises(InputError, match=r'put what runs studies below `if __name__ == "__main__":`'):
+        calstudy.load(file, **{"sky.eor.seed": 77}).run(workers=2, quiet=True)
+
+
 def test_what_a_run_lacks_has_a_reason(run, tmp_path):
+    for read in (run.gains, run.visibilities, run.gain_errors):
+        with pytest.raises(InputError, match="half = 'first': must be one of even, odd"):
+            read("residual", half="first")
     assert run.claims.empty
     assert run.parts == {}
     with pytest.raises(InputError, match="no table 'comparison'"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -213,11 +214,12 @@ def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence
     figure = style.new_figure(style.TWO_COLUMNS, 0.8 + sum(heights))
     grid = figure.subplots(len(worlds), BANDS, squeeze=False, sharex="col", height_ratios=heights)
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
-    colours = dict(zip(_names(rows), VARIANT_COLOURS, strict=False))
-    markers = dict(zip(_names(worlds), VARIANT_MARKERS, strict=False))
+    colours = dict(zip(_names(rows), cycle(VARIANT_COLOURS), strict=False))
+    markers = dict(zip(_names(worlds), cycle(VARIANT_MARKERS), strict=False))
     for panels, (world, kinds) in zip(grid, worlds.items(), strict=True):
         for band, axes in enumerate(panels):
-            _draw_panel(axes, {kind: cases[label] for kind, label in kinds.items()}, rows, shown[world], band)
+            found = {kind: cases[label] for kind, label in kinds.items()}
+            _draw_panel(axes, found, {name: rows[name] for name in shown[world]}, (colours, markers), band)
             axes.set_title(world if band == 0 else "", loc="left")
             axes.set_yticks(range(len(shown[world])), shown[world] if band == 0 else [])
     for band, axes in enumerate(grid[-1]):
@@ -249,13 +251,15 @@ def _draw_panel(
     axes: Axes,
     kinds: Mapping[str, Mapping[str, Case]],
     rows: Mapping[str, Mapping[str, str]],
-    shown: Sequence[str],
+    looks: tuple[Mapping[str, str], Mapping[str, str]],
     band: int,
 ) -> None:
-    colours, count = dict(zip(_names(rows), VARIANT_COLOURS, strict=False)), len(_names(rows)) * len(kinds)
-    for row, name in enumerate(shown):
-        for place, (variant, label) in enumerate(rows[name].items()):
-            for number, (marker, cases) in enumerate(zip(VARIANT_MARKERS, kinds.values(), strict=False)):
+    """Draw the variants of the calibrators of `rows`, with colours and markers by their names and those of worlds."""
+    colours, markers = looks
+    count = len(colours) * len(kinds)
+    for row, labels in enumerate(rows.values()):
+        for place, (variant, label) in enumerate(labels.items()):
+            for number, (kind, cases) in enumerate(kinds.items()):
                 if label not in cases:
                     continue
                 bands = cases[label].bands
@@ -264,16 +268,16 @@ def _draw_panel(
                 axes.plot(
                     upper_limit(bias, error) if limited else abs(bias),
                     row + SPREAD * ((place * len(kinds) + number + 0.5) / count - 0.5),
-                    marker="x" if _stalled(cases[label]) else marker,
+                    marker="x" if _stalled(cases[label]) else markers[kind],
                     linestyle="",
                     color=colours[variant],
                     markerfacecolor="white" if limited else colours[variant],
                 )
     axes.set_xscale("log")
     axes.set_xlim(left=LOWEST)
-    axes.set_ylim(len(shown) - 0.5, -0.5)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.axvline(1, color=style.GREY, linewidth=0.7, linestyle="--", zorder=0)
-    for edge in np.arange(len(shown) - 1) + 0.5:
+    for edge in np.arange(len(rows) - 1) + 0.5:
         axes.axhline(edge, color=style.BAND, linewidth=0.4, zorder=0)
     axes.tick_params(axis="y", length=0)
 
@@ -281,7 +285,7 @@ def _draw_panel(
 class ComparisonVariants(CasesFigure):
     """Bias of calibrators in variants and in variants of worlds: of labels such as ``sky-based, autos``."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     kind: str = "comparison-variants"
     caption = (

@@ -57,7 +57,8 @@ def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
         # Points are side by side within a bin, because members limited by the same noise coincide.
         k = member.k + (place / len(members) - 0.5) * 0.6 * np.diff(member.k).min()
         size, error = np.abs(member.bias), SIGMAS_95 * member.bias_error
-        seen, its = size > error, look(place)
+        # Where the error is not known, the point has no bar.
+        seen, its = ~(size <= error), look(place)
         points = {"color": its["color"], "marker": its["marker"], "linestyle": ""}
         axes.plot(k, np.where(seen, size, size + error), color=its["color"], linestyle=its["linestyle"], linewidth=0.4)
         axes.errorbar(k[seen], size[seen], yerr=error[seen], elinewidth=0.6, **points)

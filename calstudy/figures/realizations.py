@@ -119,7 +119,7 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
     axes.set_yscale("symlog", linthresh=3)
     bottom = min(-3.0, axes.get_ylim()[0])
     axes.set_yticks([-10, -3, -2, -1, 0, 1, 2, 3], ["−10", "−3", "−2", "−1", "0", "1", "2", "3"])
-    axes.set(ylabel="pull: mean and scatter", ylim=(bottom, 3.0))
+    axes.set(ylabel="pull: mean and scatter", ylim=(bottom, max(3.0, axes.get_ylim()[1])))
     _legend_above(axes, 1)
 
 
@@ -151,7 +151,7 @@ def _draw_corrected(axes: Axes, results: RegionResults) -> None:
         label = f"${name}$ over input"
         axes.errorbar(k, mean, SIGMAS_95 * error, fmt=marker, color=colour, elinewidth=0.7, label=label)
     axes.axhline(1, color=style.BLACK, linewidth=0.7, zorder=0)
-    axes.set(ylabel="mean over the input, 95 %", ylim=(0, 1.35))
+    axes.set(ylabel="mean over the input, 95 %", ylim=(0, max(1.35, axes.get_ylim()[1])))
     _legend_above(axes, 1)
 
 

@@ -92,7 +92,10 @@ def recovered(found: Sequence[UnbiasedSpectrum]) -> Recovered:
 
 @style.journal_style()
 def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
-    """Draw P^S, P^R and W^-1 P^R with 95 % bars, and beside them the window functions, each over its sum."""
+    """Draw P^S, P^R and W^-1 P^R with 95 % bars, and beside them the window functions, each over its sum.
+
+    Open symbols are the absolute values of negative power.
+    """
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     shift = 0.1 * np.diff(found.bin_edges)
@@ -102,7 +105,9 @@ def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
     ):
         label, marker, colour = ROUTES[name]
         bars = {"fmt": marker, "color": colour, "elinewidth": 0.7, "label": f"$P^R$, {label}"}
-        left.errorbar(found.k + (2 * place - 1) * shift, power, yerr=SIGMAS_95 * error, **bars)
+        k = found.k + (2 * place - 1) * shift
+        left.errorbar(k, np.abs(power), yerr=SIGMAS_95 * error, **bars)
+        left.plot(k[power < 0], -power[power < 0], marker, color=colour, markerfacecolor="white")
     left.plot([], [], color=style.BAND, linewidth=3, label="$P^S$")
     left.set(xlabel=style.WAVENUMBER, ylabel=rf"$P$ ({style.POWER_UNIT})", yscale="log", xlim=(0, found.bin_edges[-1]))
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=3)
@@ -162,7 +167,7 @@ class UnbiasedFigure(StudyFigure):
     of = ("experiment", "comparison")
     caption = (
         "Power spectrum of the residual outside the wedge as measured, and deconvolved with the window functions of "
-        "the calibration, beside the EoR, with 95 % bars."
+        "the calibration, beside the EoR, with 95 % bars; open symbols: negative."
     )
     variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True

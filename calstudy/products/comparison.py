@@ -324,7 +324,8 @@ def _transfer_cell(band: Mapping[str, Any]) -> str:
     cell = _cell(transfer, error)
     if transfer is None:
         return cell
-    if linear is None or not is_measured(transfer, error) or abs(transfer - linear) <= error:
+    unknown = linear is None or error is None or not is_measured(transfer, error)
+    if unknown or abs(transfer - linear) <= error:
         return marked(cell, transfer, error)
     return f"{cell} (linear {linear:.2f})"
 

@@ -2,7 +2,7 @@
 
 Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
 colon is its name, the number after it the severity. A world without a colon is severity zero of all faults that have no
-world of severity zero themselves.
+world of severity zero themselves. Negative numbers, such as levels in dB, are no severities: zero would be more.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BAND = (0.2, 0.5)
 """Band of k, h/Mpc, in which the bias is measured."""
 COUNTS = 1.0
 """A band of k counts if the upper limit of the bias is below this part of the EoR."""
-_NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+_NUMBER = re.compile(r"(?:^[-+])?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
 
 
 def upper_limit(bias: float, error: float) -> float:
@@ -55,7 +55,8 @@ def faults(worlds: Sequence[str]) -> list[Fault]:
     found: dict[str, list[tuple[float, str, str]]] = {}
     for world in worlds:
         name, colon, severity = world.partition(":")
-        if colon and (number := _NUMBER.search(severity)):
+        severity = severity.strip()
+        if colon and (number := _NUMBER.search(severity)) and float(number.group()) >= 0:
             unit, entries = severity[number.end() :].strip(), found.setdefault(name.strip(), [])
             wanted = entries[0][2] if entries else unit
             entries.append((_converted(float(number.group()), unit, wanted, world), world, wanted))
@@ -102,7 +103,8 @@ def tolerance(severities: Sequence[float], bias: np.ndarray, error: np.ndarray) 
     """
     used = [place for place, severity in enumerate(severities) if severity > 0 and np.isfinite(bias[place])]
     reached = [place for place in used if abs(bias[place]) >= LIMIT and abs(bias[place]) >= SIGMAS * error[place]]
-    unclear = [place for place in used if place not in reached and upper_limit(bias[place], error[place]) > LIMIT]
+    # An error that is not known is unclear too.
+    unclear = [place for place in used if place not in reached and not upper_limit(bias[place], error[place]) <= LIMIT]
     if not used:
         return Tolerance(math.nan, "?")
     if unclear and (not reached or unclear[0] < reached[0]):

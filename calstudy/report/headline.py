@@ -132,5 +132,7 @@ def _verdicts(claims: Sequence[Verdict]) -> Number | None:
 
 
 def _with_error(value: float, error: float) -> str:
+    if not math.isfinite(error):
+        return f"{two_digits(value)} (error not known)"
     digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < 10 else 0
     return f"{value:.{digits}f} ± {error:.{digits}f}"

@@ -72,7 +72,7 @@ def _spectra(groups: Mapping[str, Mapping[str, np.ndarray]]) -> list[Chart]:
     for name, fields in groups.items():
         column, _, series = name.rpartition(".")
         if {"k", "power", "noise_error", "sample_error"} <= fields.keys():
-            error = np.hypot(fields["noise_error"], fields["sample_error"])
+            error = fields["noise_error"] + fields["sample_error"]
             columns.setdefault(column, {})[series] = (fields["k"], fields["power"].real, error)
     charts = []
     for column, found in columns.items():

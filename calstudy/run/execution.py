@@ -28,7 +28,7 @@ from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, LocalCluster
 
 logger = logging.getLogger(__name__)
 
@@ -332,7 +332,7 @@ def _set_up_worker(log: Path) -> None:
 def _local_client(workers: int, log: Path) -> Iterator[Client]:
     """Start workers on this machine: one thread of this process, or several processes that share the cores."""
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     threads = str(max(1, cores() // workers))
     environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS"), threads)
@@ -350,7 +350,19 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
         dask.config.set(settings),
         # The thread that works here may be at another product when the run ends, and closes last.
         _errors_written_to(log) if workers == 1 else nullcontext(),
-        LocalCluster(
+        _cluster(workers) as cluster,
+        Client(cluster) as client,
+    ):
+        if workers > 1:
+            client.run(_set_up_worker, log)
+        yield client
+
+
+def _cluster(workers: int) -> LocalCluster:
+    from distributed import LocalCluster
+
+    try:
+        return LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             processes=workers > 1,
@@ -358,12 +370,13 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
             # The scheduler serves HTTP in any case: to this machine only, on any free port.
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        if workers > 1:
-            client.run(_set_up_worker, log)
-        yield client
+        )
+    except RuntimeError as error:
+        # Worker processes import the script, and would run it again.
+        raise InputError(
+            "worker processes cannot be started; in a Python script, put what runs studies below `if __name__ == "
+            f'"__main__":`, or use workers=1 ({error})'
+        ) from None
 
 
 @contextmanager

@@ -76,14 +76,18 @@ class InWorld:
 
     def standing(self, limit: float) -> Standing:
         """Return whether the bias is below the limit."""
-        margin = SIGMAS * self.transfer_error
-        if self.refused or self.transfer + margin < LOWEST or self.transfer - margin > HIGHEST:
+        if self.refused or self._is_no_solution:
             return "fails"
         # With NaN, no comparison is true.
         if abs(self.bias) - SIGMAS * self.bias_error > limit:
             return "fails"
         known = is_measured(self.transfer, self.transfer_error)
         return "passes" if known and self.upper_limit < limit else "open"
+
+    @property
+    def _is_no_solution(self) -> bool:
+        margin = SIGMAS * self.transfer_error
+        return self.transfer + margin < LOWEST or self.transfer - margin > HIGHEST
 
     @property
     def upper_limit(self) -> float:
@@ -95,8 +99,8 @@ class InWorld:
         """The world with the number for which a calibrator fails there."""
         if self.refused:
             return f"{self.world} (cannot work)"
-        is_solution = LOWEST <= self.transfer <= HIGHEST
-        return f"{self.world} ({f'bias {two_digits(self.bias)}' if is_solution else f'T {two_digits(self.transfer)}'})"
+        name, value = ("T", self.transfer) if self._is_no_solution else ("bias", self.bias)
+        return f"{self.world} ({name} {two_digits(value)})"
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,8 @@ class InBand:
     @property
     def numbers(self) -> str:
         """The upper limit of the bias in all worlds, and the smallest T."""
-        return f"bias < {two_digits(self.upper_limit)}, {self.kept}"
+        limit = self.upper_limit
+        return f"{'bias or its error not known' if math.isnan(limit) else f'bias < {two_digits(limit)}'}, {self.kept}"
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -161,6 +166,8 @@ class InBand:
         smaller = (SIGMAS + 1) * max(large, default=0.0) / self.limit
         told = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
         told = told if large else "T is not measured there"
+        if not all(math.isfinite(world.upper_limit) for world in decisive):
+            told = "a longer band of k, or more baselines, would tell"
         return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {told}"
 
 
@@ -178,11 +185,12 @@ def standings(
     limit : largest tolerated bias, over the EoR
     """
     found: dict[tuple[tuple[float, float], str], list[InWorld]] = {}
-    calibrators = dict.fromkeys(name for cases in scores.values() for name in cases)
+    refused = {(world, calibrator): None for world, calibrator, _ in refusals if world in scores}
+    scored = [name for cases in scores.values() for name in cases]
+    calibrators = dict.fromkeys([*scored, *(calibrator for _, calibrator in refused)])
     bands = dict.fromkeys(
         tuple(band["k"]) for cases in scores.values() for summary in cases.values() for band in summary["bands"]
     )
-    refused = {(world, calibrator) for world, calibrator, _ in refusals}
     for low, high in bands:
         for name in calibrators:
             rows = found.setdefault(((low, high), name), [])

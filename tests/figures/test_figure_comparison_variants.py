@@ -46,6 +46,18 @@ def test_symbols_say_what_was_measured(figure):
     assert points["o", gains].get_markerfacecolor() == "white"
 
 
+def test_symbols_of_worlds_are_those_of_the_legend_and_none_is_left_out():
+    good = with_status(case(bias=10.0, bias_error=1.0), converged=4)
+    names = [f"fit, {number}" for number in range(6)]
+    worlds = ["ideal", *(f"positions, {size} cm" for size in (2, 5, 10, 20, 50, 100))]
+    figure = draw_variants({world: dict.fromkeys(names, good) for world in worlds}, names)
+    legend = {
+        text.get_text(): line for text, line in zip(figure.legends[0].texts, figure.legends[0].get_lines(), strict=True)
+    }
+    drawn = [line.get_marker() for line in figure.axes[2].lines if line.get_linestyle() == "None"]
+    assert drawn == 6 * [legend[f"{size} cm"].get_marker() for size in (2, 5, 10, 20, 50, 100)]
+
+
 def test_each_kind_of_world_has_the_calibrators_that_worked_there(figure):
     short, long = figure.axes[0], figure.axes[2]
     assert short.get_title(loc="left") == "short"

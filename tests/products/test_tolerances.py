@@ -21,6 +21,16 @@ def test_a_severity_of_zero_of_its_own_takes_the_place_of_the_ideal_world():
     assert (found.worlds, found.severities) == (("drift: 0 %", "drift: 1 %"), (0.0, 1.0))
 
 
+def test_levels_are_no_severities_and_hyphens_no_signs():
+    assert faults(["ideal", "coupling: -40 dB", "coupling: -30 dB"]) == []
+    [found] = faults(["ideal", "cable: delay-50 ns"])
+    assert found.severities == (0.0, 50.0)
+
+
+def test_an_error_that_is_not_known_tells_nothing():
+    assert tolerance(SEVERITIES, np.array([0, 3, 5, 9]), np.full(4, np.nan)).relation == "?"
+
+
 def test_severities_are_compared_in_one_unit():
     [found] = faults(["ideal", "positions: 5 mm", "positions: 2 cm", "positions: 0.1 cm"])
     assert found.severities == pytest.approx((0.0, 1.0, 5.0, 20.0))

@@ -126,7 +126,7 @@ def test_curves_are_the_arrays_of_the_figure(tmp_path):
     (chart,) = read_charts(path)
     assert chart.title == "Power spectra, far"
     (series,) = json.loads(json.dumps(chart.data))["series"]
-    assert (series["x"], series["y"], series["error"]) == ([0.2, 0.3], [-3.0, 123460.0], [5.0, 13.0])
+    assert (series["x"], series["y"], series["error"]) == ([0.2, 0.3], [-3.0, 123460.0], [7.0, 17.0])
 
 
 def test_maps_are_the_arrays_of_the_figure(tmp_path):

@@ -54,6 +54,25 @@ def test_errors_that_are_smaller_by_the_stated_factor_tell():
     assert standing_of(case(0.05 / 1.5001, 0.05 / 1.5001)).standing == "passes"
 
 
+def test_what_cannot_work_in_any_of_the_worlds_fails():
+    (found, other) = standings({"w": {"name": case(0.0, 0.01)}}, [("w", "other", "no"), ("elsewhere", "third", "no")])
+    assert (found.standing, other.calibrator, other.standing) == ("passes", "other", "fails")
+    assert str(other) == "fails in w (cannot work)"
+
+
+def test_the_number_for_which_a_calibrator_fails_is_named():
+    # T is within two errors of what a solution can have.
+    assert str(standing_of(case(5.0, 0.1, transfer=1.25, transfer_error=0.1))) == "fails in ideal (bias 5)"
+    assert str(standing_of(case(5.0, 0.1, transfer=None))) == "fails in ideal (bias 5)"
+
+
+def test_an_error_that_is_not_known_is_said():
+    found = standing_of(case(5.0, None))
+    assert found.standing == "open"
+    assert "bias or its error not known" in str(found)
+    assert "nan" not in str(found)
+
+
 def test_what_is_no_solution_fails_though_its_bias_is_small():
     assert standing_of(case(0.0, 0.01, transfer=-155.0, transfer_error=10.0)).standing == "fails"
     assert standing_of(case(0.0, 0.01, transfer=1.3, transfer_error=0.2)).standing == "open"
