@@ -21,12 +21,19 @@ NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$
 
 
 @lru_cache(maxsize=256)
-def _factor(unit: str, target: str) -> float:
-    """Return the factor from `unit` to `target`; raises ValueError if the dimensions differ."""
+def _factor(unit: str, target: str, plain: bool) -> float:
+    """Return the factor from `unit` to `target`; raises ValueError if the dimensions differ.
+
+    A `plain` unit has no number of its own.
+    """
     from astropy import units
 
+    found = units.Unit(unit)
+    # "80 2 kHz" would have the unit "2 kHz", and "10 dB(m)" has a logarithmic one.
+    if not isinstance(found, units.UnitBase) or (plain and found.scale != 1):
+        raise ValueError(unit)
     try:
-        return float(units.Unit(unit).to(units.Unit(target)))
+        return float(found.to(units.Unit(target)))
     except units.UnitConversionError:
         raise ValueError(unit) from None
 
@@ -56,7 +63,7 @@ def parse_quantity(value: Any, target: str, example: str) -> float:
     if not math.isfinite(number):
         raise _fail(value, f"is not finite: {hint}")
     try:
-        factor = _factor(unit, target)
+        factor = _factor(unit, target, isinstance(value, str))
     except (ValueError, TypeError):
         raise _fail(value, f"has a unit that cannot be converted to {target}: {hint}") from None
     # Rounding removes binary errors: numbers are easier to read, and equal quantities in any unit have equal hashes.

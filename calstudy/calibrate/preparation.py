@@ -156,12 +156,17 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         structure,
         visibilities,
         weights,
-        prepared.start[:, :, times.start, polarization],
+        prepared.start[:, :, times.start + fullest(weights, times.stop - times.start), polarization],
         sky,
         settings.prior if isinstance(settings, ForegroundFit) else "sum",
         frozen=settings.frozen,
         deviations=deviations,
     )
+
+
+def fullest(weights: np.ndarray, n_times: int) -> int:
+    """Return the first of the integrations that are solved together, (Ntimes Nbls, Nfreqs), with the most data."""
+    return int(np.argmax(np.count_nonzero(weights.reshape(n_times, -1), axis=1)))
 
 
 def _deviations(sky: np.ndarray | None, weights: np.ndarray, settings: GainFit) -> tuple[float, float]:

@@ -247,13 +247,23 @@ class Experiment(Section):
 
     @model_validator(mode="after")
     def _antennas_and_effects_are_independent(self) -> Experiment:
-        # Both are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
-        effects = enumerate(self.corruption.effects)
-        seeds = {f"corruption.effects.{place}.seed": getattr(effect, "seed", None) for place, effect in effects}
-        for name, seed in self.instrument.as_built.drawn_seeds.items():
-            for path, other in seeds.items():
-                if seed == other:
-                    raise fault(path, f"is {other}, as that of instrument.as_built.{name}: give one of them another")
+        # All are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
+        noise = self.corruption.noise
+        even_and_odd, twins = getattr(noise, "seeds", ()), getattr(noise, "seeds_without_eor", None) or ()
+        if any(seed in twins and twins.index(seed) != place for place, seed in enumerate(even_and_odd)):
+            raise fault(
+                "corruption.noise.seeds_without_eor", "has the seed of even data where seeds has that of odd data"
+            )
+        built = self.instrument.as_built.drawn_seeds
+        drawn: list[tuple[str, int | None]] = [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
+        drawn += [("corruption.noise", seed) for seed in {*even_and_odd, *twins}]
+        for place, effect in enumerate(self.corruption.effects):
+            drawn.append((f"corruption.effects.{place}.seed", getattr(effect, "seed", None)))
+        for number, (path, seed) in enumerate(drawn):
+            for other, its in drawn[:number]:
+                # Effects are compared with each other, and with their drifts, by `CorruptionSettings`.
+                if seed == its is not None and not (other.startswith("corruption.effects") or other == path):
+                    raise fault(path, f"is {seed}, as that of {other}: give one of them another")
         return self
 
     @property

@@ -64,9 +64,23 @@ def _read(path: Path, modified: int) -> UVBeam:
     angles = None if beam.feed_angle is None else dict(zip(beam.feed_array, beam.feed_angle, strict=True))
     if angles is not None and not np.isclose(abs(angles["x"]), np.pi / 2):
         raise InputError(f"instrument.beam.path: feed x of {path} is not east-west, which it must be")
+    if beam.pixel_coordinate_system == "az_za":
+        _require_whole_sky(beam, path)
     if beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za":
         return beam
     return _on_grid(beam, feeds, path)
+
+
+def _require_whole_sky(beam: UVBeam, path: Path) -> None:
+    """Raise InputError if a table does not reach the horizon, or all azimuths, to a step of its grid."""
+    azimuth, zenith_angle = beam.axis1_array, beam.axis2_array
+    steps = [np.diff(axis).max(initial=0.0) for axis in (azimuth, zenith_angle)]
+    if zenith_angle[-1] < np.pi / 2 - 1.01 * steps[1] or np.ptp(azimuth) < 2 * np.pi - 1.01 * steps[0]:
+        raise InputError(
+            f"instrument.beam.path: {path} must have all azimuths and zenith angles up to 90 deg; it has "
+            f"{np.degrees(np.ptp(azimuth)):.0f} deg of azimuth, and zenith angles up to "
+            f"{np.degrees(zenith_angle[-1]):.0f} deg"
+        )
 
 
 def _feeds(beam: UVBeam) -> list[str]:

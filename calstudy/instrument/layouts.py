@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from astropy.coordinates import EarthLocation
 
 
+NEARBY = 1.0
+"""deg, by which a site may differ from the mean of the positions of its antennas."""
+
+
 class Place(NamedTuple):
     """A place on the WGS84 ellipsoid: latitude and longitude in deg, north and east positive, and height in m."""
 
@@ -80,7 +84,7 @@ class Layout:
 
     Antenna numbers, (Nants,), and names are unique. The number of an MWA tile is its index in the 128-tile
     configuration, also in layouts that use a part of it. `place` is the site: the centre of the array, for arrays at
-    their own site.
+    their own site. `surveyed` is true if it is that of positions in latitude and longitude.
     """
 
     name: str
@@ -88,6 +92,7 @@ class Layout:
     names: tuple[str, ...]
     enu: np.ndarray
     place: Place
+    surveyed: bool = False
 
     @property
     def location(self) -> EarthLocation:
@@ -220,9 +225,18 @@ def _require_valid(made: Layout, origin: str) -> None:
 def make_array(settings: InstrumentSettings) -> Layout:
     """Return the antennas of an instrument, at `instrument.location` or at the layout's own site.
 
-    Raises InputError as `make_layout`.
+    Raises InputError as `make_layout`, or if the site is not that of positions in latitude and longitude.
     """
-    return replace(make_layout(settings.layout), place=place_of(settings.site))
+    found, place = make_layout(settings.layout), place_of(settings.site)
+    if found.surveyed:
+        apart = np.array(found.place[:2]) - place[:2]
+        apart[1] = (apart[1] + 180) % 360 - 180
+        if np.abs(apart).max() > NEARBY:
+            raise InputError(
+                f"instrument.location: is at {place.latitude:.2f}, {place.longitude:.2f} deg, and {found.name} at "
+                f"{found.place.latitude:.2f}, {found.place.longitude:.2f} deg; give the place of the array, and degrees"
+            )
+    return replace(found, place=place)
 
 
 def redundant_groups(vectors: np.ndarray, tolerance: float) -> RedundantGroups:

@@ -33,6 +33,8 @@ class Estimator(Plugin, ABC):
     registry: ClassVar = ESTIMATORS
 
     kind: str = Field("", description="Name of an estimator, or a file.py.")
+    largest_antenna: ClassVar[int | None] = None
+    """Largest number of an antenna that it accepts, or None."""
 
     @abstractmethod
     def estimate(self, even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> DelaySpectra:
@@ -57,6 +59,15 @@ class Estimator(Plugin, ABC):
         """Return the delay spectra of `estimate`, and write files in formats of the estimator into an empty folder."""
         del folder
         return self.estimate(even, odd, beam, settings)
+
+
+def require_antennas(settings: PowerSettings, numbers: np.ndarray, remedy: str) -> None:
+    """Raise InputError if the estimator does not accept the number of an antenna."""
+    largest = cast(Estimator, settings.estimator).largest_antenna
+    if largest is not None and numbers.max() > largest:
+        raise InputError(
+            f"antenna number {numbers.max()} is too large for the estimator, allowed: 0 to {largest}; {remedy}"
+        )
 
 
 def estimate_spectra(

@@ -14,6 +14,7 @@ from calstudy.base.gains import ErrorsOfFile, write_gain_errors
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import positions, to_cube
 from calstudy.calibrate.agreement import GainCoverage, pulls
+from calstudy.calibrate.cost import dimensions_of
 from calstudy.calibrate.execution import cost_of
 from calstudy.calibrate.gain_errors import MOST_UNKNOWNS, ErrorsInTime, GainErrors
 from calstudy.calibrate.gain_realizations import GainRealizations
@@ -88,6 +89,17 @@ def observed_gain_errors(graph: MeasuredGraph, part: str, wanted: bool | int = T
     )
 
 
+def _without_errors(settings: Calibrator) -> str:
+    """Return why no fit of a calibrator has errors by its own matrix; empty if they may."""
+    if not isinstance(settings, GainFit):
+        return f"{settings.label} is no fit by least squares"
+    if settings.smooth_gains is not None:
+        return "the gains were smoothed after the fit"
+    if settings.baselines is not None and settings.baselines.taper is not None:
+        return "weights with a taper are no inverse variances of the noise"
+    return ""
+
+
 class OfSolves(Calibrated):
     """What is made of the errors of the gains of every solve of a calibration."""
 
@@ -100,9 +112,8 @@ class OfSolves(Calibrated):
 
         settings = self.calibrator
         rows, nothing = np.arange(len(result.gains.ant_array)), np.zeros(0)
-        if not isinstance(settings, GainFit) or settings.smooth_gains is not None:
-            smoothed = "the gains were smoothed after the fit"
-            reason = smoothed if isinstance(settings, GainFit) else f"{settings.label} is no fit by least squares"
+        reason = _without_errors(settings)
+        if reason or not isinstance(settings, GainFit):
             yield from (SolvedGains(rows, slice(0), 0, nothing, reason) for _ in result.solutions)
             return
         # The solution is known, and a start of its own would cost more than the errors.
@@ -134,12 +145,17 @@ class OfSolves(Calibrated):
         size = size_of(self)
         matrix = min(2 * size.antennas * size.channels.count, MOST_UNKNOWNS) ** 2 * COMPLEX128
         blocks = size.antennas * (2 * size.channels.count) ** 2 * COMPLEX128 / 2
-        memory = LIBRARIES_MEMORY + 3 * matrix + blocks + 4 * size.samples * COMPLEX128
+        # The sequences of the foregrounds of every baseline.
+        dimensions = dimensions_of(size, self.calibrator) if isinstance(self.calibrator, GainFit) else None
+        sequences = 0.0 if dimensions is None else COMPLEX128 / 2 * dimensions.coefficients * size.channels.count
+        memory = LIBRARIES_MEMORY + 3 * matrix + blocks + sequences + 4 * size.samples * COMPLEX128
         return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
-class ErrorsOfGains(OfSolves, stage="gain-errors", version=5):
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=6):
     """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged.
+
+    Since version 6 fits with a taper have no errors by their matrix.
 
     If no solve has errors by its own matrix, they come from fits to this many `realizations` of the noise, unless it is
     zero.

@@ -23,6 +23,7 @@ from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.gain_files import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.records import PARALLEL_HANDS
+from calstudy.instrument.array_layouts.csv import read_positions
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import LAYOUTS
 from calstudy.realdata.selection import Selection, select
@@ -257,6 +258,7 @@ def place_antennas(data: UVData, path: Path) -> str:
     if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
         raise InputError("observed.positions: the data are phased to a source, by the positions that they have")
     try:
+        read_positions(path, numbered=True)
         layout = make_layout(LAYOUTS.make({"kind": "csv", "path": path}))
     except InputError as error:
         raise InputError(str(error).replace("instrument.layout.path", "observed.positions")) from None

@@ -143,6 +143,11 @@ def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: boo
 def _antenna(data: UVData, name: str) -> int:
     numbers, names = data.telescope.antenna_numbers.tolist(), list(data.telescope.antenna_names)
     present = set(data.ant_1_array.tolist()) | set(data.ant_2_array.tolist())
+    if name in names and name.isdecimal() and int(name) in present and numbers[names.index(name)] != int(name):
+        raise InputError(
+            f"--select antennas: {name!r} is the name of antenna {numbers[names.index(name)]} and the number of "
+            f"'{names[numbers.index(int(name))]}'; rename the antennas"
+        )
     number = numbers[names.index(name)] if name in names else int(name) if name.isdecimal() else None
     if number is None or number not in present:
         raise InputError(

@@ -172,5 +172,9 @@ def machine() -> dict[str, Any]:
 
 def seeds(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return every seed in nested settings but those of scales, by its dotted path."""
-    found = {path: value for path, value in leaves(settings) if path.rpartition(".")[2] in ("seed", "seeds")}
+    found = {
+        path: value
+        for path, value in leaves(settings)
+        if path.rpartition(".")[2] in ("seed", "seeds", "seeds_without_eor")
+    }
     return {path: value for path, value in found.items() if not path.startswith("scales.")}

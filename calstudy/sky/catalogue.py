@@ -188,6 +188,12 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     stokes[0, 0] = values["flux"] * units.Jy
     spectrum: dict[str, Any] = {"spectral_type": "flat"}
     if "spectral_index" in values:
+        if (lacking := ~np.isfinite(values["spectral_index"])).any():
+            row = np.flatnonzero(usable)[lacking][0] + 1
+            raise ValueError(
+                f"{lacking.sum()} sources have no spectral index, such as that of row {row}; give all of them one, or "
+                "leave out csv.spectral_index"
+            )
         spectrum = {"spectral_type": "spectral_index", "spectral_index": values["spectral_index"]}
     return SkyModel(
         name=np.flatnonzero(usable).astype(str),

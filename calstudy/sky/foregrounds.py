@@ -316,6 +316,11 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
     sky = _read(settings)
     if sky.component_type != "point":
         raise InputError(f"sky.foregrounds.path: {settings.path} holds a HEALPix map; a catalogue of points is needed")
+    if sky.spectral_type == "spectral_index" and (lacking := ~np.isfinite(sky.spectral_index)).any():
+        raise InputError(
+            f"sky.foregrounds.path: {lacking.sum()} sources of {settings.path} have no spectral index, such as "
+            f"{sky.name[lacking][0]}; give all of them one, or leave out the column"
+        )
     at_centre = _at_frequency(sky, float(np.mean(frequencies)))
     flux = at_centre.stokes[0, 0].to_value("Jy")
     flux = np.where(np.isfinite(flux), flux, -np.inf)
@@ -372,6 +377,13 @@ def _has_frequencies(sky: SkyModel, frequencies: np.ndarray) -> bool:
     return all(np.abs(tabulated - frequency).min() < FREQUENCY_TOLERANCE for frequency in frequencies)
 
 
+def _in_jansky(sky: SkyModel) -> SkyModel:
+    """Return points with fluxes in Jy, also if they are in K sr; maps stay as they are."""
+    if sky.component_type == "point" and sky.stokes.unit.is_equivalent("K sr"):
+        sky.kelvin_to_jansky()
+    return sky
+
+
 def _require_idl(path: Path) -> None:
     """Raise ValueError unless a file starts as IDL save files do; scipy raises a bare Exception for others."""
     with path.open("rb") as stream:
@@ -413,6 +425,6 @@ def _read(settings: section.FileSources) -> SkyModel:
             return _read_votable(path, settings.votable)
         if settings.csv is not None:
             return read_csv_catalogue(path, settings.csv)
-        return SkyModel.from_file(str(path))
+        return _in_jansky(SkyModel.from_file(str(path)))
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"sky.foregrounds.path: {path} cannot be read as a catalogue ({error})") from error

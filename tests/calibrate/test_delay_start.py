@@ -330,3 +330,19 @@ def test_an_experiment_says_so_by_name(cables):
     assert prepared.start.shape == (ANTENNAS, FREQUENCIES.size, 2, 1)
     for time in (0, 1):
         assert rms(errors(toy, delays_of(prepared.start[:, :, time, 0]), delays)) < 5e-9
+
+
+def test_integrations_that_are_solved_together_start_where_there_are_data(cables):
+    toy, _ = cables
+    settings = WITH_DELAYS.model_copy(update={"integrations_per_solve": 3})
+    uvd = make_uvdata(toy, n_times=3)
+    sky = from_cube(uvd, np.broadcast_to(toy.foregrounds[None, :, :, None], (3, *toy.foregrounds.shape, 1)).copy())
+    first = []
+    for flagged in (False, True):
+        if flagged:
+            uvd.flag_array[uvd.time_array == uvd.time_array.min()] = True
+        (solve,) = run_calibrator(settings, uvd, sky).solutions
+        first.append(solve.loss_history[0])
+    assert solve.usable
+    # Two thirds of the data, from the same start.
+    assert first[1] == pytest.approx(first[0] * 2 / 3, rel=0.05)

@@ -112,3 +112,11 @@ def test_gains_of_measured_data_have_them_if_asked_for(calibrated):
         assert record["gain_errors"]["median_phase"] == pytest.approx(NOISE / np.sqrt(2 * 7), rel=0.5)
     reason = calibrated("without", True).solution["records"][0]["gain_errors"]["reason"]
     assert "is no fit by least squares" in reason
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_fits_with_a_taper_have_them_by_realizations_alone(calibrated):
+    settings = {"calibrator": "sky-based", "weights": "flags", "baselines": {"taper": "20 m"}}
+    without = calibrated("matrix", True, **settings).solution["records"][0]["gain_errors"]
+    assert without == {"reason": "weights with a taper are no inverse variances of the noise"}
+    assert calibrated("realizations", 2, **settings).solution["records"][0]["gain_errors"]["realizations"] == 2

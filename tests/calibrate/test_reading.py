@@ -160,3 +160,11 @@ def test_files_come_back_as_written(data, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_visibilities([tmp_path / "none.uvh5"])
     assert isinstance(data, UVData)
+
+
+def test_a_name_that_is_the_number_of_another_antenna_is_refused(data):
+    swapped = data.copy()
+    names = swapped.telescope.antenna_names
+    names[0], names[1] = str(swapped.telescope.antenna_numbers[1]), str(swapped.telescope.antenna_numbers[0])
+    with pytest.raises(InputError, match=r"'10' is the name of antenna 12 and the number of '12'; rename"):
+        prepare(swapped, Selection(antennas=("10", "14", "16")))

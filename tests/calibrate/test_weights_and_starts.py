@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pyuvdata import UVFlag
-from toy import make_toy, scattered
-from toy_data import ONE_SOLVE, SETTINGS, make_uvdata
+from toy import FREQUENCIES, make_toy, scattered
+from toy_data import ONE_SOLVE, SETTINGS, make_uvdata, sky_of, statuses
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
@@ -233,3 +235,16 @@ def test_one_antenna_is_refused(toy):
     only = make_uvdata(make_toy(scattered(3), autos=True), 1).select(bls=[(10, 10)], inplace=False)
     with pytest.raises(ValueError, match="no cross-correlations"):
         run_calibrator(SETTINGS, only)
+
+
+@pytest.mark.parametrize(
+    "settings", [SkyBased(gain_delay="200 ns"), SETTINGS.model_copy(update={"gain_delay": 200e-9})]
+)
+def test_smooth_gains_of_integrations_with_other_flagged_edges(settings):
+    # Noise at which the damping is that of the integration before, whose blocks are of another band.
+    toy = make_toy(scattered(6), noise=0.1)
+    toy = replace(toy, gains=np.full(toy.gains.shape, 1.1 + 0j))
+    uvd = make_uvdata(toy, n_times=3)
+    uvd.flag_array.reshape(3, -1, FREQUENCIES.size)[1:, :, :4] = True
+    found = run_calibrator(settings.model_copy(update={"weights": FlagWeights()}), uvd, sky_of(uvd, toy.foregrounds))
+    assert statuses(found) == ["converged"] * 3

@@ -18,7 +18,7 @@ from calstudy.corrupt.interface import GainEffect, apply_effect, draw_truth
 from calstudy.corrupt.levels import rms, set_levels
 from calstudy.corrupt.noise import thermal_noise
 from calstudy.corrupt.settings import EFFECTS, CorruptionSettings
-from calstudy.experiment.files import validate
+from calstudy.experiment.files import override, validate
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
@@ -220,6 +220,32 @@ def test_positions_and_effects_with_one_seed_are_refused(tmp_path):
     # Nothing is drawn from it.
     data["instrument"]["as_built"]["positions"]["scatter"] = "0 cm"
     assert validate(data, tmp_path).instrument.as_built.drawn_seeds == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"corruption.effects": [{"kind": "per-channel-gains", "seed": 3}]}, "is 3, as that of corruption.noise"),
+        ({"instrument.as_built": {"positions": {"scatter": "1 cm", "seed": 4}}}, "as that of instrument.as_built"),
+        (
+            {
+                "instrument.as_built": {
+                    "positions": {"scatter": "1 cm", "seed": 9},
+                    "beams": {"pointing_scatter": "1 deg", "seed": 9},
+                }
+            },
+            "is 9, as that of instrument.as_built.positions",
+        ),
+        ({"corruption.noise.seeds_without_eor": [4, 3]}, "has the seed of even data where seeds has that of odd"),
+    ],
+)
+def test_what_draws_the_same_numbers_is_refused(changes, told, tmp_path):
+    data = tiny(tmp_path)
+    for path, value in changes.items():
+        data = override(data, path, value)
+    data = override(data, "corruption.noise.seeds", [3, 4])
+    with pytest.raises(ExperimentError, match=told):
+        validate(data, tmp_path)
 
 
 def test_default_seeds_are_all_different():

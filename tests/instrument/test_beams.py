@@ -272,6 +272,14 @@ def test_beamfits_round_trip(tmp_path, embedded):
     np.testing.assert_allclose(beam.solid_angles(BAND, "yy"), embedded.solid_angles(BAND, "yy"), rtol=1e-4)
 
 
+@pytest.mark.parametrize("part", [{"axis2_inds": np.arange(30)}, {"axis1_inds": np.arange(180)}])
+def test_a_table_of_a_part_of_the_sky_is_refused(tmp_path, embedded, part):
+    path = tmp_path / "beam.beamfits"
+    embedded.at(np.arange(166e6, 199.5e6, 1e6)).select(**part, inplace=False).write_beamfits(path)
+    with pytest.raises(InputError, match="must have all azimuths and zenith angles up to 90 deg"):
+        make_beam(FileBeam(kind="beamfits", path=path))
+
+
 def test_unusable_beam_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
         make_beam(MwaEmbeddedBeam(path=tmp_path / "none.h5"))

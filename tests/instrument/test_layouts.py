@@ -17,7 +17,8 @@ from calstudy.base.errors import InputError
 from calstudy.instrument.array_layouts.csv import CsvLayout
 from calstudy.instrument.array_layouts.geometric import GOLOMB_MARKS, HexLayout, LinearLayout, RectangularLayout
 from calstudy.instrument.array_layouts.observatories import HeraLayout, MwaLayout
-from calstudy.instrument.layouts import SITES, east_north_up, make_layout, redundant_groups
+from calstudy.instrument.layouts import SITES, east_north_up, make_array, make_layout, redundant_groups
+from calstudy.instrument.settings import InstrumentSettings
 
 
 def vectors_of(layout):
@@ -174,11 +175,28 @@ def test_latitudes_and_longitudes_become_distances(tmp_path):
     np.testing.assert_allclose(found - found.mean(axis=0), enu - enu.mean(axis=0), atol=2e-3)
 
 
+def test_positions_in_degrees_are_compared_with_the_site(tmp_path):
+    path = tmp_path / "array.csv"
+    path.write_text("lat,lon,alt\n-30.0,179.9999,0\n-30.0,-179.9999,0\n")
+    at = {"layout": {"kind": "csv", "path": path}, "beam": "airy"}
+
+    def array(latitude, longitude):
+        place = {"latitude": f"{latitude} deg", "longitude": f"{longitude} deg"}
+        return make_array(InstrumentSettings.model_validate({**at, "location": place}))
+
+    # Both sides of the meridian of 180 degrees.
+    assert np.ptp(array(-30.3, 180.0).enu[:, 0]) == pytest.approx(19.3, abs=0.1)
+    assert array(-30.3, -179.5).place.latitude == -30.3
+    with pytest.raises(InputError, match=r"instrument.location: is at -26.00, 116.00 deg, and array at -30.00"):
+        array(-26, 116)
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
         ("latitude,longitude\n-30,21\n-30,21\n", "height_m"),
         ("latitude,longitude,height_m\n-30,21,0\n30,21,0\n", "one degree"),
+        ("number,east_m,north_m,up_m\n1,0,0,0\n3000000000,1,0,0\n", "antenna number 3000000000 .* exceeds"),
         ("e,east_m,n,u\n0,0,0,0\n1,1,1,1\n", "twice"),
         ("e n u\n0 0 0\n1 1\n", "cells"),
         ("east_m,north_m\n0,0\n1,1\n", "up_m"),

@@ -11,7 +11,7 @@ from hera_pspec import UVPSpec
 
 from calstudy.base.errors import InputError
 from calstudy.instrument.array_layouts.geometric import GolombLayout
-from calstudy.power.interface import Estimator, estimate_spectra
+from calstudy.power.interface import Estimator, estimate_spectra, require_antennas
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra, delay_spectra
 from calstudy.power.tables import load_spectrum, save_spectrum
@@ -73,3 +73,11 @@ def test_delay_spectra_are_stored_with_units_and_read_without_hera_pspec(data, b
 def test_spectra_that_do_not_fit_are_refused(data, beam, changes, told):
     with pytest.raises(InputError, match=rf"estimator 'Spoiled': .*{told}"):
         estimate_spectra(*data, beam, spoiled(changes))
+
+
+def test_antenna_numbers_that_the_estimator_cannot_take_are_refused_before_the_run():
+    numbers = np.array([0, 899])
+    require_antennas(PowerSettings(), numbers, "rename them")
+    with pytest.raises(InputError, match=r"antenna number 900 is too large .* allowed: 0 to 899; rename them"):
+        require_antennas(PowerSettings(), numbers + 1, "rename them")
+    require_antennas(spoiled({}), numbers + 1, "rename them")

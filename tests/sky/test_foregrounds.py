@@ -225,10 +225,35 @@ def test_a_csv_is_read_by_the_columns_named(tmp_path):
     sky = make_foregrounds(section.FileSources.model_validate(steep), FREQUENCIES).sky
     at_300 = sky.at_frequencies(np.array([300e6]) * units.Hz, inplace=False)
     assert flux(at_300) == pytest.approx([0.75, 3 * np.sqrt(2)])
+    path.write_text("dec,s,ra,alpha\n-30.0,1.5,10.0,-1.0\n-20.0,3.0,20.0,\n")
+    for spectrum in ("flat", "catalogue"):
+        with pytest.raises(
+            InputError, match=r"mine\.csv cannot .*1 sources have no spectral index, such as that of row 2"
+        ):
+            make_foregrounds(section.FileSources.model_validate({**steep, "spectrum": spectrum}), FREQUENCIES)
     with pytest.raises(InputError, match="no column flux, only dec, s, ra, alpha"):
         make_foregrounds(section.FileSources(kind="file", path=path, csv={**CSV, "flux": "flux"}), FREQUENCIES)
     with pytest.raises(ValidationError, match="required for CSV files"):
         section.FileSources(kind="file", path=path)
+
+
+def test_points_in_kelvin_have_their_flux(tmp_path):
+    path = tmp_path / "mine.skyh5"
+    sky = SkyModel(
+        name=np.array(["a"]),
+        skycoord=SkyCoord([10.0], [-30.0], unit="deg", frame="icrs"),
+        stokes=np.array([[[2.0]], [[0]], [[0]], [[0]]]) * units.Jy,
+        reference_frequency=np.array([180e6]) * units.Hz,
+        spectral_type="spectral_index",
+        spectral_index=np.array([-0.8]),
+    )
+    settings = section.FileSources.model_validate({"kind": "file", "path": path})
+    found = []
+    for convert in (lambda: None, sky.jansky_to_kelvin):
+        convert()
+        sky.write_skyh5(str(path), clobber=True)
+        found.append(flux(make_foregrounds(settings, FREQUENCIES).sky))
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
 
 
 def test_a_votable_needs_its_columns_named(tmp_path):

@@ -405,10 +405,13 @@ def test_the_report_has_figures_and_numbers(one_file):
         ({}, {"outputs": {"figures": ["observed-signal-loss"]}}, "needs the section injection"),
         ({}, {"injection": {"level": -30}}, "injection.level"),
         ({"positions": "few.csv"}, {}, "has no antenna"),
+        ({"positions": "named.csv"}, {}, "named.csv needs a column number, by which antennas are found"),
     ],
 )
 def test_errors_get_a_sentence(one_file, folder, observed, sections, sentence):
     (folder / "few.csv").write_text("number,east_m,north_m,up_m\n0,0,0,0\n1,10,0,0\n")
+    rows = "".join(f"ant{row},{10 * row},0,0\n" for row in range(100))
+    (folder / "named.csv").write_text(f"name,east_m,north_m,up_m\n{rows}")
     path = observed_file(folder, "broken", {"data": "one.uvh5", **observed}, **sections)
     with pytest.raises((ExperimentError, InputError)) as caught:
         load_study(path)

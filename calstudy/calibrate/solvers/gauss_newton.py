@@ -30,7 +30,7 @@ import numpy as np
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
-from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 from calstudy.calibrate.projection import Projection
 from calstudy.calibrate.records import Solve
 from calstudy.calibrate.solvers.interface import WarmStart
@@ -137,6 +137,13 @@ class GaussNewtonState:
         return self.predicted / (1 - shrinking) / self.history[-1] if shrinking < 1 else math.inf
 
 
+class Blocks(NamedTuple):
+    """The antenna blocks of a fit, and its structure."""
+
+    structure: FitStructure
+    preconditioner: AntennaPreconditioner
+
+
 @dataclass(frozen=True)
 class GaussNewton:
     """Variable projection with a damped Gauss-Newton iteration.
@@ -159,7 +166,10 @@ class GaussNewton:
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and reuse the preconditioner of the warm start."""
-        memory: AntennaPreconditioner | None = None if warm is None else warm.memory
+        kept: Blocks | None = None if warm is None else warm.memory
+        # Smooth gains of integrations with other flagged edges have other coefficients.
+        fits = kept is not None and (kept.structure == problem.structure or problem.structure.gain_vectors is None)
+        memory = kept.preconditioner if kept is not None and fits else None
         kernels = compiled(problem.structure, problem.frozen)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
         projection = kernels.project(reduced.gains, *reduced.data)
@@ -316,12 +326,14 @@ class GaussNewton:
             return self._checked(state).predicted / loss
         return newton_decrement_at(problem, pairs.to_complex(state.gains))
 
-    def memory(self, state: GaussNewtonState) -> AntennaPreconditioner | None:
+    def memory(self, state: GaussNewtonState) -> Blocks | None:
         """Return the antenna blocks, which change little from one integration to the next.
 
         Those of double precision are not kept: each integration decides by itself whether it continues there.
         """
-        return state.preconditioner if state.kernels.dtype == tf.float32 else None
+        if state.preconditioner is None or state.kernels.dtype != tf.float32:
+            return None
+        return Blocks(state.kernels.structure, state.preconditioner)
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Adapt the antenna blocks to the damping of the state, or compute them, and predict the next step."""

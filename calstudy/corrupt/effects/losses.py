@@ -138,7 +138,7 @@ class Decoherence(Effect):
     )
     chance: Fraction = Field(1.0, gt=0, le=1, description="Chance of a board to lose anything in a block.")
     per_board: int = Field(
-        3, ge=1, description="How many consecutive antennas of the layout share a board; the default is HERA's."
+        3, ge=1, description="How many antennas, in the order of their numbers, share a board; the default is HERA's."
     )
     block: Frequency = Field(
         11.71875e6,

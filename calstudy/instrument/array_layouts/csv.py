@@ -25,6 +25,7 @@ COLUMNS = {
     "number": (),
 }
 """Columns and their other names, in small letters; those of one letter are pyuvsim's."""
+LARGEST_NUMBER = 2**31 - 1
 LOCAL, GEODETIC = ("east_m", "north_m", "up_m"), ("latitude", "longitude", "height_m")
 
 
@@ -55,28 +56,36 @@ class CsvLayout(ArrayLayout):
         InputError
             If there is no such file, or it does not hold antenna positions.
         """
-        if not self.path.is_file():
-            raise InputError(f"instrument.layout.path: there is no file {self.path}")
-        rows = _read_rows(self.path)
-        columns = set(rows[0]) if rows else set()
-        geodetic = {"latitude", "longitude"} <= columns and not set(LOCAL) <= columns
-        missing = set(GEODETIC if geodetic else LOCAL) - columns
-        if missing or len(rows) < 2:
-            raise InputError(
-                f"instrument.layout.path: {self.path} needs at least two rows with columns east_m, north_m, up_m, or "
-                "latitude, longitude, height_m" + (f"; missing: {', '.join(sorted(missing))}" if missing else "")
-            )
-        try:
-            positions = np.array([[float(row[name]) for name in (GEODETIC if geodetic else LOCAL)] for row in rows])
-            numbers = np.array([int(row["number"]) for row in rows]) if "number" in columns else np.arange(len(rows))
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"instrument.layout.path: {self.path} holds an entry that is not a number ({error})"
-            ) from None
-        if geodetic:
-            positions = _about_their_mean(positions, self.path)
-        names = tuple(row["name"] for row in rows) if "name" in columns else tuple(f"ant{n:03d}" for n in numbers)
-        return Layout(self.path.stem, numbers, names, positions, SITES["mwa"])
+        return read_positions(self.path)
+
+
+def read_positions(path: Path, numbered: bool = False) -> Layout:
+    """Return the antennas of a table; with `numbered`, raise InputError if it does not number them."""
+    if not path.is_file():
+        raise InputError(f"instrument.layout.path: there is no file {path}")
+    rows = _read_rows(path)
+    columns = set(rows[0]) if rows else set()
+    geodetic = {"latitude", "longitude"} <= columns and not set(LOCAL) <= columns
+    missing = set(GEODETIC if geodetic else LOCAL) - columns
+    if missing or len(rows) < 2:
+        raise InputError(
+            f"instrument.layout.path: {path} needs at least two rows with columns east_m, north_m, up_m, or "
+            "latitude, longitude, height_m" + (f"; missing: {', '.join(sorted(missing))}" if missing else "")
+        )
+    if numbered and "number" not in columns:
+        raise InputError(f"instrument.layout.path: {path} needs a column number, by which antennas are found")
+    try:
+        positions = np.array([[float(row[name]) for name in (GEODETIC if geodetic else LOCAL)] for row in rows])
+        numbers = np.array([int(row["number"]) for row in rows]) if "number" in columns else np.arange(len(rows))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"instrument.layout.path: {path} holds an entry that is not a number ({error})") from None
+    if numbers.max() > LARGEST_NUMBER:
+        raise InputError(f"instrument.layout.path: antenna number {numbers.max()} in {path} exceeds {LARGEST_NUMBER}")
+    place = SITES["mwa"]
+    if geodetic:
+        positions, place = _about_their_mean(positions, path)
+    names = tuple(row["name"] for row in rows) if "name" in columns else tuple(f"ant{n:03d}" for n in numbers)
+    return Layout(path.stem, numbers, names, positions, place, surveyed=geodetic)
 
 
 def _read_rows(path: Path) -> Sequence[Mapping[str, str]]:
@@ -104,11 +113,13 @@ def _read_rows(path: Path) -> Sequence[Mapping[str, str]]:
     return [dict(zip(names, row, strict=True)) for row in rows]
 
 
-def _about_their_mean(geodetic: np.ndarray, path: Path) -> np.ndarray:
-    """Return east, north, up of latitudes and longitudes in degrees and heights in m, (Nants, 3), about their mean."""
+def _about_their_mean(geodetic: np.ndarray, path: Path) -> tuple[np.ndarray, Place]:
+    """Return east, north, up of latitudes and longitudes in degrees and heights in m, (Nants, 3), and their mean."""
     from astropy.coordinates import EarthLocation
 
     latitudes, longitudes, heights = geodetic.T
+    # Neighbours on either side of 180 degrees differ by little.
+    longitudes = longitudes[0] + (longitudes - longitudes[0] + 180) % 360 - 180
     if not (np.abs(latitudes) <= 90).all() or np.ptp(longitudes) > 1 or np.ptp(latitudes) > 1:
         raise InputError(
             f"instrument.layout.path: latitudes in {path} must be from -90 to 90 degrees, and latitudes and longitudes "
@@ -118,4 +129,4 @@ def _about_their_mean(geodetic: np.ndarray, path: Path) -> np.ndarray:
     found = EarthLocation.from_geodetic(longitudes, latitudes, heights)
     vectors = np.column_stack([axis.to_value("m") for axis in found.geocentric])
     centre = [axis.to_value("m") for axis in place.location.geocentric]
-    return east_north_up(vectors - centre, place)
+    return east_north_up(vectors - centre, place), place

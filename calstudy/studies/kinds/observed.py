@@ -14,6 +14,7 @@ from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Scales
 from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
+from calstudy.power.interface import require_antennas
 from calstudy.power.settings import PowerSettings
 from calstudy.products.table import tables_of
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
@@ -98,6 +99,7 @@ def _halves(file: ObservedFile) -> Parts:
     section = file.observed
     even = read_selected(file, section.data)
     odd = read_selected(file, section.odd) if section.odd else even
+    require_antennas(file.power, even.frame.numbers, "leave them out by observed.select.antennas")
     if section.odd:
         require_same_sky(even, odd)
     elif even.times.size < 2:
