@@ -96,7 +96,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     if gains is None and settings.initial_gains.kind == "file":
         gains = read_gains(settings.initial_gains.path, "calibration.initial_gains.path", data.uvd)
     if gains is None and settings.initial_gains.kind == "redundant":
-        start = redundant_start(data, weights, settings.initial_gains, settings.redundancy_tolerance)
+        start = redundant_start(data, weights, settings.initial_gains, settings.redundancy_tolerance, sky)
     elif gains is None and settings.initial_gains.kind == "delays":
         start = delay_start(data, weights, settings.initial_gains, sky)
     else:
@@ -215,13 +215,20 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
     return np.where(np.isfinite(values) & (values != 0), values, 1)
 
 
-def redundant_start(data: Observation, weights: np.ndarray, settings: RedundantStart, tolerance: float) -> np.ndarray:
+def redundant_start(
+    data: Observation,
+    weights: np.ndarray,
+    settings: RedundantStart,
+    tolerance: float,
+    sky: np.ndarray | None = None,
+) -> np.ndarray:
     """Solve redundant baselines for gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
 
     Redundant baselines measure the same sky, so that the ratios of their visibilities are ratios of gains (Liu et al.
     2010). A delay and a phase for each antenna (firstcal) bring phases within reach of the logarithm, in which the
     equations are linear (logcal). Redundancy does not determine amplitude, phase and phase gradients of the whole
-    array. These are set to unity, or stay as firstcal has them.
+    array. Gradients are those of the sky model, as `data.visibilities`, if there is one: foregrounds that groups share
+    would follow any other. The rest is set to unity, or stays as firstcal has it.
 
     Autocorrelations and samples of weight zero, (Ntimes, Nbls, Nfreqs, Npols), have no influence. Baselines that differ
     by less than `tolerance`, in m, are redundant. Gains are unity for antennas without redundant baselines, and where
@@ -249,6 +256,14 @@ def redundant_start(data: Observation, weights: np.ndarray, settings: RedundantS
             for row, back in turned.items()
         }
         solved = _solve(reds, visibilities, used, data.frequencies, settings.delays)
+        if sky is not None:
+            model = {
+                keys[row]: np.conj(sky[:, row, :, p]) if back else sky[:, row, :, p] for row, back in turned.items()
+            }
+            overlap = {
+                key: used[key] * values * np.nan_to_num(model[key]).conj() for key, values in visibilities.items()
+            }
+            solved = _along_sky(reds, overlap, solved)
         for row, number in enumerate(data.numbers):
             if int(number) in solved:
                 gains[row, :, :, p] = solved[int(number)].T
@@ -277,6 +292,25 @@ def _solve(
         _, solution = calibrator.logcal(DataContainer(rest), wgts=DataContainer(weights))
         solution.remove_degen(degen_sol={antenna: np.ones_like(gain) for antenna, gain in solution.gains.items()})
     return {key[0]: np.asarray(gain * first.get(key, 1), complex) for key, gain in solution.gains.items()}
+
+
+def _along_sky(
+    reds: list[list[tuple[int, int, str]]],
+    overlap: dict[tuple[int, int, str], np.ndarray],
+    gains: dict[int, np.ndarray],
+) -> dict[int, np.ndarray]:
+    """Return gains with the phase gradient of the sky model; `overlap` are weighted data times its conjugate."""
+    from hera_cal.abscal import complex_phase_abscal
+    from hera_cal.datacontainer import DataContainer
+
+    # All that the gradient depends on: the sum over each group.
+    heads = {group[0]: sum(overlap[key] * gains[key[0]].conj() * gains[key[1]] for key in group) for group in reds}
+    ones = {key: np.ones_like(values) for key, values in heads.items()}
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        _, turns = complex_phase_abscal(DataContainer(heads), DataContainer(ones), reds, list(heads), list(heads))
+    known = {antenna: np.where(np.isfinite(turn) & (turn != 0), turn, 1) for (antenna, _), turn in turns.items()}
+    return {antenna: gain * known.get(antenna, 1) for antenna, gain in gains.items()}
 
 
 def _product(gains: dict[tuple[int, str], np.ndarray], key: tuple[int, int, str], like: np.ndarray) -> np.ndarray:

@@ -311,7 +311,8 @@ class GainFit(WeightedFit):
     """
 
     solver: Solver = GaussNewtonSettings()
-    initial_gains: InitialGains = UnityStart()
+    # A redundant start has the phase gradients of the sky model since 2.
+    initial_gains: InitialGains = Field(UnityStart(), json_schema_extra={REVISED: 2})
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     gain_delay: Delay | None = Field(
         None,

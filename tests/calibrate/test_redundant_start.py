@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from toy import FREQUENCIES, HEX, make_toy, scattered
-from toy_data import ONE_SOLVE, make_uvdata
+from toy_data import ONE_SOLVE, make_uvdata, sky_of
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
+from calstudy.calibrate.calibrators.least_squares import CalamityRedundant
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import prepare
 from calstudy.calibrate.problem import gain_products
-from calstudy.calibrate.settings import RedundantStart
+from calstudy.calibrate.settings import BasisSettings, FlagWeights, RedundantStart
 from calstudy.instrument.layouts import redundant_groups
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
@@ -74,3 +75,20 @@ def test_flagged_samples_have_no_influence(hexagon):
 def test_arrays_without_redundancy_are_refused():
     with pytest.raises(InputError, match="needs redundant baselines"):
         start_of(make_toy(scattered(5)), delays=False)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_foregrounds_that_groups_share_start_with_the_phase_gradient_of_the_sky_model(seed):
+    toy = make_toy(HEX, noise=1e-3, seed=seed)
+    delays = np.random.default_rng(seed).uniform(-50e-9, 50e-9, 7)
+    toy = replace(toy, gains=toy.gains * np.exp(2j * np.pi * delays[:, None] * FREQUENCIES))
+    data = make_uvdata(toy, 1)
+    settings = CalamityRedundant(
+        basis=BasisSettings(min_delay="50 ns", buffer="50 ns"),
+        weights=FlagWeights(),
+        initial_gains=RedundantStart(kind="redundant"),
+    )
+    (solve,) = run_calibrator(settings, data, sky_of(data, toy.foregrounds)).solutions
+    # With another gradient the sums of model and sky model have no common scale.
+    assert solve.status == "converged"
+    assert solve.loss_history[-1] < 2e-6 * np.mean(np.abs(toy.visibilities) ** 2)
