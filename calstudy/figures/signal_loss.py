@@ -203,7 +203,7 @@ def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9) -> Figure:
     left.set_title(f"outside wedge + {1e9 * buffer:.0f} ns")
     left.legend(loc="lower right")
     _draw_lengths(right, loss)
-    left.set_ylim(-0.03, 1.15)
+    left.set_ylim(-0.03, max(1.15, left.get_ylim()[1]))
     return figure
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -276,12 +276,20 @@ class DataCalibration(DataStudy):
                 flag_unsolved(work)
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
             self._write_gains_also(work)
-            # Those of an earlier calibration that may be replaced.
-            for name in set(results_in(folder)) - {path.name for path in work.iterdir()}:
-                (folder / name).unlink()
+            self._remove_earlier(folder, {path.name for path in work.iterdir()})
             for path in work.iterdir():
                 path.replace(folder / path.name)
         return solution
+
+    def _remove_earlier(self, folder: Path, written: Container[str]) -> None:
+        """Remove results of an earlier calibration that this one does not replace, but for files that it reads."""
+        if not (folder / SOLUTION).exists():
+            return
+        section = self.file.observed
+        read = {Path(path).resolve() for path in (*section.data, section.sky_model, self.start) if path is not None}
+        for path in (folder / name for name in results_in(folder)):
+            if path.name not in written and path.resolve() not in read:
+                path.unlink()
 
     def _write_gains_also(self, work: Path) -> None:
         """Write the gains of a folder in other formats."""

@@ -194,6 +194,10 @@ def test_gains_of_other_formats_are_not_overwritten_either(command, data, tmp_pa
 def test_results_that_are_replaced_leave_none_of_the_earlier_calibration(command, data, finished, tmp_path):
     shutil.copytree(finished[0] / "out", tmp_path / "out")
     (tmp_path / "out" / "notes.txt").write_text("mine")
+    start = ["--gains", "out/gains.calfits"]
+    assert command(data, *OPTIONS, *start, "--output", "out", "--overwrite")[0] == 0
+    # What it reads is kept.
+    assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt", "gains.calfits"}
     assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt"}
 
