@@ -255,8 +255,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a key without the version",
-        "own = [*self.stage, identity(self.settings), inputs]",
-        "own = [self.stage.name, identity(self.settings), inputs]",
+        "own = [*self.stage, self.content, inputs]",
+        "own = [self.stage.name, self.content, inputs]",
         KEYS,
     ),
     Mutation(
