@@ -282,7 +282,7 @@ def test_faults_of_folders_are_sentences(skycal, home, tmp_path, capsys):
 
     assert "no such folder" in told(tmp_path / "nowhere")
     assert "has no manifest.json" in told(tmp_path)
-    assert "other digests" in told(skycal, home / "secret.yaml", "--set", "corruption.noise.seeds=[7, 8]")
+    assert "other digests" in told(skycal, home / "secret.yaml", "--set", "corruption.noise.seeds=[17, 18]")
     lacking = tmp_path / "lacking"
     shutil.copytree(skycal, lacking)
     shutil.copy(lacking / "data-2.calh5", lacking / "data-2.calfits")
@@ -328,7 +328,7 @@ def test_a_folder_takes_part_in_a_comparison_beside_the_built_in_ones(skycal, ho
         "experiment": "secret.yaml",
         "calibrators": {"built in": {**SKYCAL, "chunks": 1}, "mine": {"calibrator": "by-file",
                         "folder": skycal.name}},
-        "worlds": {"first": {"calibration.assumed": ASSUMED}, "second": {"corruption.noise.seeds": [7, 8]}},
+        "worlds": {"first": {"calibration.assumed": ASSUMED}, "second": {"corruption.noise.seeds": [17, 18]}},
         "figures": ["comparison-matrix"],
     }  # fmt: skip
     path = home / "comparison.yaml"
