@@ -483,7 +483,7 @@ class OpenRun:
         study = self._experiment
         if self._variant(variant).calibrate:
             return read_visibilities(self._product(self._calibration(variant, half), study) / RESIDUAL)
-        data = corruption.data(study.graph, self._variant(variant), _known(half))
+        data = corruption.data(study.graph, self._variant(variant), _half(half))
         return read_visibilities(self._product(data, study) / DATA)
 
     @property
@@ -561,7 +561,7 @@ class OpenRun:
     def _calibration(self, variant: str, half: Half) -> Task:
         if not self._variant(variant).calibrate:
             raise InputError(f"{variant!r} is not calibrated")
-        return calibration.calibration(self._experiment.graph, self._variant(variant), _known(half))
+        return calibration.calibration(self._experiment.graph, self._variant(variant), _half(half))
 
     def _product(self, task: Task, study: Study) -> Path:
         stores = self._stores(study.outputs)
@@ -602,7 +602,8 @@ def _plain(value: Any, path: str = "") -> Any:
     raise InputError(f"{path} = {value!r}: a {type(value).__name__} cannot be in a file; give a number, text or list")
 
 
-def _known(half: str) -> str:
+def _half(half: str) -> str:
+    """Return the name of a half of the data; raises InputError if it is none."""
     if half not in PARITIES:
         raise InputError(f"half = {half!r}: must be one of {', '.join(PARITIES)}")
     return half

@@ -217,7 +217,7 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
     With `redundant`, one amplitude and one phase gradient across the array in every channel are removed as well, which
     the redundancy of an array does not determine. On a lattice a gradient may be of any number of turns per baseline,
     elsewhere it must be less than half a turn per baseline. Raises InputError if the two have no gains in common, or
-    fewer than two channels, or such as are no part of equally spaced ones.
+    fewer than two channels, or channels that do not lie on an evenly spaced grid.
     """
     if not pair.first.any():
         raise InputError("all gains that the two files have in common are flagged in either")
@@ -246,7 +246,7 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
 
 
 def _even_grid(frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return equally spaced channels that contain the given ones, and the place of each; raises InputError if none do.
+    """Return evenly spaced channels that contain the given ones, and the place of each; raises InputError if none do.
 
     Files that lack channels have gaps, and so have the channels that two files have in common.
     """
@@ -256,7 +256,9 @@ def _even_grid(frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     steps = (frequency - frequency[0]) / width
     place = np.rint(steps).astype(int)
     if np.abs(steps - place).max() > SAME_CHANNEL or place[-1] >= MOST_GRID * frequency.size:
-        raise InputError("the channels of the two files are no part of equally spaced ones; average or select them")
+        raise InputError(
+            "the common channels of the two files do not lie on an evenly spaced grid; average or select them"
+        )
     return np.linspace(frequency[0], frequency[-1], place[-1] + 1), place
 
 

@@ -156,7 +156,7 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         structure,
         visibilities,
         weights,
-        prepared.start[:, :, times.start + fullest(weights, times.stop - times.start), polarization],
+        prepared.start[:, :, times.start + _fullest(weights, times.stop - times.start), polarization],
         sky,
         settings.prior if isinstance(settings, ForegroundFit) else "sum",
         frozen=settings.frozen,
@@ -164,7 +164,7 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
     )
 
 
-def fullest(weights: np.ndarray, n_times: int) -> int:
+def _fullest(weights: np.ndarray, n_times: int) -> int:
     """Return the first of the integrations that are solved together, (Ntimes Nbls, Nfreqs), with the most data."""
     return int(np.argmax(np.count_nonzero(weights.reshape(n_times, -1), axis=1)))
 

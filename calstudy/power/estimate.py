@@ -26,6 +26,7 @@ from calstudy.base.constants import BOLTZMANN, SPEED_OF_LIGHT
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
+from calstudy.power.settings import HERA_PSPEC_ANTENNAS
 
 if TYPE_CHECKING:
     from hera_pspec.conversions import Cosmo_Conversions
@@ -171,9 +172,6 @@ POWER_UNIT = "mK2 h-3 Mpc3"
 
 HERA_TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "none"}
 
-LARGEST_ANTENNA_NUMBER = 899
-"""hera_pspec writes the numbers of four antennas, plus 100, into the twelve digits of one integer."""
-
 Baseline = tuple[int, int]
 
 
@@ -195,10 +193,10 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
     if an antenna number is too large for hera_pspec.
     """
     baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
-    if antenna_pairs(uvd).max() > LARGEST_ANTENNA_NUMBER:
+    if antenna_pairs(uvd).max() > HERA_PSPEC_ANTENNAS:
         raise ValueError(
             f"antenna number {antenna_pairs(uvd).max()} is too large for hera_pspec, allowed: 0 to "
-            f"{LARGEST_ANTENNA_NUMBER}"
+            f"{HERA_PSPEC_ANTENNAS}"
         )
     same = Pairs(baselines, baselines, redundant=False)
     if settings.pairs == "same-baseline":

@@ -14,6 +14,9 @@ from calstudy.base.units import Delay, Length, Time, Wavenumber
 ESTIMATORS: Registry[Any] = Registry("estimator", "calstudy.power.estimators", "calstudy.power.interface:Estimator")
 
 MOST_BINS = 10_000
+HERA_PSPEC_ANTENNAS = 899
+"""Largest number of an antenna in hera_pspec, which writes those of four, plus 100, into the twelve digits of one
+integer."""
 
 
 class KBins(Section):

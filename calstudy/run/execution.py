@@ -58,8 +58,16 @@ class WorkOrder:
         own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
         bare = task.given({name: name for name in inputs})
-        known = {"key": task.key, "content": task.content, "made_with": own, "disk": task.cost.disk}
-        return cls(task=bare, inputs=inputs, store=store.root, again=again, **known)
+        return cls(
+            task=bare,
+            key=task.key,
+            inputs=inputs,
+            store=store.root,
+            again=again,
+            made_with=own,
+            content=task.content,
+            disk=task.cost.disk,
+        )
 
     @property
     def name(self) -> str:

@@ -192,7 +192,8 @@ class DataCalibration(DataStudy):
         facts = read_selected(content, content.observed.data, even=False)
         if {"hyperdrive", "mwaocal"} & set(content.also) and set(facts.polarizations) != LINEAR:
             raise InputError(
-                "also: hyperdrive and mwaocal hold gains of xx and yy, and the data have others; take calfits or h5parm"
+                "also: hyperdrive and mwaocal hold gains of xx and yy, which the data do not both have; take calfits "
+                "or h5parm"
             )
         return cls(content, Parts({WHOLE: facts}))
 

@@ -167,7 +167,7 @@ class InBand:
         told = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
         told = told if large else "T is not measured there"
         if not all(math.isfinite(world.upper_limit) for world in decisive):
-            told = "a longer band of k, or more baselines, would tell"
+            told = "a wider band of k, or more baselines, would tell"
         return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {told}"
 
 
@@ -185,7 +185,7 @@ def standings(
     limit : largest tolerated bias, over the EoR
     """
     found: dict[tuple[tuple[float, float], str], list[InWorld]] = {}
-    refused = {(world, calibrator): None for world, calibrator, _ in refusals if world in scores}
+    refused = dict.fromkeys((world, calibrator) for world, calibrator, _ in refusals if world in scores)
     scored = [name for cases in scores.values() for name in cases]
     calibrators = dict.fromkeys([*scored, *(calibrator for _, calibrator in refused)])
     bands = dict.fromkeys(

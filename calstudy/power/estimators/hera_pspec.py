@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.power.interface import Estimator, PowerBeam
+from calstudy.power.settings import HERA_PSPEC_ANTENNAS
 from calstudy.power.spectra import DelaySpectra, delay_spectra
 
 if TYPE_CHECKING:
@@ -17,8 +18,7 @@ if TYPE_CHECKING:
 class HeraPspec(Estimator):
     """hera_pspec's quadratic estimator with identity weighting; all pairs of baselines are exported to pspec.h5."""
 
-    # It writes the numbers of four antennas, plus 100, into the twelve digits of one integer.
-    largest_antenna: ClassVar[int | None] = 899
+    largest_antenna: ClassVar[int | None] = HERA_PSPEC_ANTENNAS
 
     def estimate(self, even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSettings) -> DelaySpectra:
         """Return the delay spectra of even times odd; see `calstudy.power.estimate.estimate_power`."""
