@@ -75,7 +75,7 @@ def test_the_report_works_at_any_width(folder, width):
     # Once on top, and once below the figure.
     assert found["points"] == 6
     assert "k = 0.3" in found["curve"]
-    assert "residual, P^R: 1230 ± 5" in found["curve"]
+    assert "residual, P^R: 1230 ± 7" in found["curve"]
     assert "P = 4.20e+6" in found["map"]
     assert "baseline of 28 m" in found["map"]
     assert found["dialog"]
