@@ -88,7 +88,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
         weights = inverse_variances(observation, fitted, weights, settings, assumed.noise)
     data, used = observation.baselines(fitted), weights > 0
     if settings.baselines is not None:
-        weights = weights * settings.baselines.factors(data.lengths)[:, None, None]
+        weights = weights * settings.baselines.factors(data.lengths, data.antennas)[:, None, None]
     sky = None if assumed.sky_model is None else assumed.sky_model.baselines(fitted).visibilities
     _require_finite(data)
     structure = make_structure(data, settings)

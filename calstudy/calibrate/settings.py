@@ -84,6 +84,8 @@ Solver = Annotated[
 
 UNSETTLED = 10.0
 """Weights from gains that still change by more than this times the tolerance in the last pass have not converged."""
+LEAST_TAPER = 1e-4
+"""Antennas whose baselines all have less than this part of their weight are left out of a fit."""
 RUNAWAY = 1.0
 """Weights that change by more than themselves in the last pass run away; the first pass is the result then."""
 
@@ -159,7 +161,12 @@ class BaselineRange(Section):
     shortest: Length = Field(0.0, ge=0, description="Shorter baselines have no weight.")
     longest: Length | None = Field(None, gt=0, description="Longer baselines have no weight; null: all have.")
     taper: Length | None = Field(
-        None, gt=0, description="Weights are multiplied by a Gaussian of the length with this standard deviation."
+        None,
+        gt=0,
+        description="Weights are multiplied by a Gaussian of the length with this standard deviation. Antennas whose "
+        "factors are all below 1e-4 are left out, and flagged.",
+        # Such antennas kept the gains that they started from until 2.
+        json_schema_extra={REVISED: 2},
     )
 
     @model_validator(mode="after")
@@ -168,11 +175,17 @@ class BaselineRange(Section):
             raise fault("longest", f"{self.longest:g} m is not above shortest, {self.shortest:g} m")
         return self
 
-    def factors(self, lengths: np.ndarray) -> np.ndarray:
-        """Return the factors on the weights of baselines of some lengths, m."""
+    def factors(self, lengths: np.ndarray, antennas: np.ndarray) -> np.ndarray:
+        """Return the factors on the weights of baselines of some lengths, m, between antennas, (Nbls, 2).
+
+        Where all factors of an antenna are below `LEAST_TAPER` they are zero: a fit converges before its gains move.
+        """
         chosen = (lengths >= self.shortest) & (lengths <= (math.inf if self.longest is None else self.longest))
-        taper = 1.0 if self.taper is None else np.exp(-((lengths / self.taper) ** 2) / 2)
-        return chosen * taper
+        factors = chosen * (1.0 if self.taper is None else np.exp(-((lengths / self.taper) ** 2) / 2))
+        largest = np.zeros(antennas.max() + 1)
+        for column in antennas.T:
+            np.maximum.at(largest, column, factors)
+        return np.where((largest[antennas] >= LEAST_TAPER).all(axis=1), factors, 0.0)
 
 
 class UnityStart(Section):
@@ -241,8 +254,9 @@ class ForegroundPrior(Section):
     noise: FluxDensity | None = Field(
         None,
         gt=0,
-        description="Standard deviation of the noise of one sample, against which finite deviations are weighed; null: "
-        "that of the experiment, or, with `weights: autos`, of the radiometer equation.",
+        description="Standard deviation of the noise of one sample, against which finite deviations are weighed, "
+        "from the mean of inverse variances where samples differ; null: that of the experiment, or, with `weights: "
+        "autos`, of the radiometer equation.",
     )
 
     @model_validator(mode="after")
@@ -295,7 +309,7 @@ class WeightedFit(Calibrator):
         """
         if self.baselines is None:
             return frame
-        chosen = self.baselines.factors(frame.lengths) > 0
+        chosen = self.baselines.factors(frame.lengths, frame.antennas) > 0
         if not chosen.any():
             raise InputError(
                 f"baselines: none lies within the range; the data have {frame.lengths.min():.0f} to "

@@ -109,9 +109,10 @@ def require_long_baselines(run: Results, k: float) -> None:
     in the fit of the gains.
     """
     experiment = run.experiment
-    lengths = pdist(make_array(experiment.instrument).enu)
+    enu = make_array(experiment.instrument).enu
+    lengths, antennas = pdist(enu), np.stack(np.triu_indices(len(enu), 1), axis=1)
     fitted = experiment.calibration.baselines if isinstance(experiment.calibration, WeightedFit) else None
-    longest = float((lengths if fitted is None else lengths[fitted.factors(lengths) > 0]).max())
+    longest = float((lengths if fitted is None else lengths[fitted.factors(lengths, antennas) > 0]).max())
     reached = k_of_delay(experiment, longest / SPEED_OF_LIGHT + experiment.power.wedge_buffer)
     if reached < k:
         raise Unevaluated(

@@ -52,8 +52,9 @@ def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> n
 def sample_noise(data: UVData) -> float | None:
     """Return sigma of cross-correlations with nsamples of 1, by the radiometer equation, in the unit of the data.
 
-    It is the rms over all unflagged samples and polarizations; None without the autocorrelations of all antennas, or if
-    none of their samples can be used.
+    Its inverse square is the mean of the inverse variances of all unflagged samples and polarizations, so that weights
+    of that mean have the right level; the rms, which loud antennas decide, is larger. None without the autocorrelations
+    of all antennas, or if none of their samples can be used.
     """
     all_pairs, all_flags = antenna_pairs(data), flag_cube(data)
     crosses = all_pairs[:, 0] != all_pairs[:, 1]
@@ -66,7 +67,7 @@ def sample_noise(data: UVData) -> float | None:
         single = (variance * counts[..., polarization])[~flags[..., polarization]]
         found.append(single[np.isfinite(single)])
     values = np.concatenate(found)
-    return float(np.sqrt(np.mean(values))) if values.size else None
+    return float(np.mean(1 / values) ** -0.5) if values.size else None
 
 
 def half_difference(even: UVData, odd: UVData) -> UVData:

@@ -15,7 +15,7 @@ from toy import FREQUENCIES, LARGE_HEX, complex_normal, make_toy, point_source_v
 from toy_data import SETTINGS, make_uvdata, sky_of
 
 from calstudy.base.observation import Observation
-from calstudy.base.visibilities import to_cube
+from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.calibrate.basis import dpss_vectors
 from calstudy.calibrate.calibrators.least_squares import SkyBased
 from calstudy.calibrate.calibrators.other_packages import Skycal
@@ -203,3 +203,20 @@ def test_baselines_out_of_range_have_no_influence_and_are_calibrated(name):
     assert np.abs(residual[lengths <= short]).max() < 1e-5 * rms
     scale = np.mean(np.abs(residual[lengths > short] / (toy.foregrounds * (1 - 3j))[lengths > short]))
     assert scale == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["sky-based", "skycal"])
+def test_antennas_without_any_weight_in_a_taper_are_flagged(name):
+    """Their gains would stay where they start: nothing that they change is seen in the loss."""
+    calibrator, positions = CALIBRATORS[name]
+    far = np.vstack([positions, [[400.0, 0.0, 0.0]]])
+    toy = make_toy(far, noise=0.0)
+    uvd = make_uvdata(toy, n_times=1)
+    tapered = calibrator.model_copy(update={"baselines": BaselineRange(taper="60 m")})
+    result = run_calibrator(tapered, uvd, sky_of(uvd, toy.foregrounds))
+    last = (toy.antennas == len(positions)).any(axis=1)
+    flags = flag_cube(result.residual)[0, :, :, 0]
+    assert flags[last].all()
+    assert not flags[~last].any()
+    residual = to_cube(result.residual)[0, :, :, 0]
+    assert np.abs(residual[~last]).max() < 1e-5 * np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))

@@ -16,6 +16,7 @@ from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.calibrators.least_squares import DelayWeighted, SkyBased
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import starting_gains
+from calstudy.calibrate.problem import gain_weights
 from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, FlagWeights, ForegroundPrior, SampleWeights
 from calstudy.calibrate.weights import inverse_variances, make_weights
 from calstudy.realdata.noise import radiometer_variance, sample_noise
@@ -105,12 +106,30 @@ def test_noise_of_measured_data_is_that_of_a_sample_that_was_measured_once(measu
     once.nsample_array = np.ones(measured.data_array.shape)
     crosses = antenna_pairs(measured)
     crosses = crosses[crosses[:, 0] != crosses[:, 1]]
-    expected = np.sqrt(np.nanmean(radiometer_variance(once, crosses, 0)))
+    expected = np.nanmean(1 / radiometer_variance(once, crosses, 0)) ** -0.5
     assert sample_noise(once) == pytest.approx(expected)
     four_times = once.copy()
     four_times.nsample_array = 4 * once.nsample_array
     assert sample_noise(four_times) == pytest.approx(expected)
     assert sample_noise(make_uvdata(make_toy(scattered(5)), 1)) is None
+
+
+def test_weights_from_gains_are_inverse_variances_where_amplitudes_differ():
+    """The level of the noise is from autocorrelations; with the rms over samples it would be too low."""
+    data = make_uvdata(make_toy(scattered(5), autos=True), 1)
+    pairs = antenna_pairs(data)
+    cross = pairs[:, 0] != pairs[:, 1]
+    gains = np.exp(0.3 * np.random.default_rng(13).normal(size=(5, FREQUENCIES.size)))
+    first, second = np.searchsorted(np.unique(pairs), pairs).T
+    products = gains[first] * gains[second]
+    data.data_array[~cross] = 3e4 * products[~cross][..., None]
+    data.nsample_array = np.full(data.data_array.shape, 2.0)
+    observation, settings = Observation(data), FlagWeights()
+    calibrator = DelayWeighted(foreground_prior=ForegroundPrior(mean="sky-model", deviation=0.1))
+    equal = make_weights(observation, cross, settings)
+    unity = inverse_variances(observation, cross, equal, calibrator, sample_noise(data))[0, :, :, 0]
+    found = gain_weights(unity, products[cross])
+    assert np.allclose(found, 1 / radiometer_variance(data, pairs[cross], 0)[0], rtol=1e-9)
 
 
 def uvflag(data, values, path):

@@ -92,7 +92,7 @@ class OtherPackage(WeightedFit):
         data, sky = observation.baselines(crosses), assumed.sky_model.baselines(crosses)
         if not (np.isfinite(data.visibilities) | data.flags).all():
             raise InputError(f"{self.label}: unflagged visibilities are not finite; flag them")
-        factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths)[:, None]
+        factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths, data.antennas)[:, None]
         groups = self.solves(data.n_times)
         gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
         outcomes: list[Solve] = []
