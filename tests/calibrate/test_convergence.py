@@ -49,6 +49,7 @@ def bias_of(pair, baselines, estimates):
     ],
     ids=["gauss-newton", "adamax"],
 )
+@pytest.mark.chain
 def test_the_distance_from_the_minimum_is_the_bias(pair, baselines, solver, steps):
     paths = [trace(toy.problem(), solver, steps) for toy in pair]
     noise = np.mean(np.abs(pair[0].noise) ** 2)

@@ -246,6 +246,7 @@ def test_parts_that_no_baseline_connects_are_fitted_each(cables):
 
 
 @pytest.mark.parametrize("with_sky", [True, False])
+@pytest.mark.chain
 def test_long_cables_are_as_easy_as_none_from_there_and_out_of_reach_from_unity(cables, with_sky):
     """Within 1 % of the loss that is reached from the true gains."""
     toy, _ = cables

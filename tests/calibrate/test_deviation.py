@@ -78,6 +78,7 @@ def settled(problem, seed=0):
         (HEX, "both", (0.01, 0.05)),
     ],
 )
+@pytest.mark.chain
 def test_the_size_of_the_errors_of_a_sky_model_is_found(positions, prior, deviations):
     pulls = []
     for seed in range(1, 5):

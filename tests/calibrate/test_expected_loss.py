@@ -103,6 +103,7 @@ def test_exact_diagonal_is_that_of_the_projector_on_all_tangent_vectors(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.chain
 def test_random_probes_agree_with_the_exact_diagonal_within_their_errors(kind):
     problem, gains, model = case(kind)
     exact = expected_transfer(problem, gains, model, MODES)

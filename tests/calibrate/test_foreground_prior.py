@@ -269,6 +269,7 @@ def wide_prior(hexagon, prior, own, shared) -> CalibrationProblem:
 
 
 @pytest.mark.parametrize(("prior", "own", "shared"), [("own", 1.0, 0.0), ("both", 0.05, 0.1)])
+@pytest.mark.chain
 def test_wide_priors_converge_to_the_minimum(hexagon, prior, own, shared):
     """The curvature that the prior gives to smooth gains is a millionth of that of the data, and is not damped away.
 
@@ -298,6 +299,7 @@ def test_singular_blocks_of_the_preconditioner_do_not_keep_a_fit_from_converging
     assert found.loss_history[-1] < 1.001 * expected.loss_history[-1]
 
 
+@pytest.mark.chain
 def test_refused_steps_are_the_exception_in_curved_valleys():
     """Where damping that was raised is lowered again at once, every third step is refused."""
     simulation = Simulation(Case(antennas=12, channels=96, noise=NOISE))

@@ -190,6 +190,7 @@ def test_the_command_writes_numbers_and_a_figure(template, gains, tmp_path, caps
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.chain
 def test_gains_of_two_noise_realizations_differ_by_their_errors_and_others_by_more(tmp_path, capsys):
     """Of calamity, whose errors leave smooth gains out: chi^2 is one for equal gains and above it for others."""
     toy = make_toy(scattered(10), noise=1e-2)

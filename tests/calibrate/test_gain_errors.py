@@ -165,6 +165,7 @@ def is_covered(values, limits=(0.03, 0.02)):
         pytest.param(UNEQUAL, {"kind": "calamity"}, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.chain
 def test_errors_cover_the_scatter_of_noise(toy, settings):
     found = pulls(toy, **settings)
     assert is_covered(found)

@@ -117,6 +117,14 @@ EASIER_OR_LARGER = {
     "3 km, 500 ns",
 }
 """With shorter cables than cases of the same array, or more data: left to ``pytest -m slow``."""
+QUICK = {"six antennas, 300 ns", "flagged antenna, 300 ns"}
+"""In the default suite; the others are left to ``pytest -m chain``."""
+
+
+def marks(name):
+    if name in EASIER_OR_LARGER:
+        return [pytest.mark.slow]
+    return [] if name in QUICK else [pytest.mark.chain]
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +143,7 @@ def floors():
 
 
 @pytest.mark.parametrize("with_sky", [True, False], ids=["sky model", "no sky model"])
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in EASIER_OR_LARGER else []) for name in CASES]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in CASES])
 def test_the_minimum_is_found_from_delays(name, with_sky, floors):
     simulation, problem, floor = floors(name, CASES[name])
     sky = simulation.foregrounds(0) if with_sky else None
@@ -146,6 +152,7 @@ def test_the_minimum_is_found_from_delays(name, with_sky, floors):
     assert solution.record.loss_history[-1] < limit * floor
 
 
+@pytest.mark.chain
 def test_from_unity_cables_are_out_of_reach_and_the_status_says_so(floors):
     _, problem, floor = floors("random, 300 ns", CASES["random, 300 ns"])
     solution = solve(problem, SOLVER)
@@ -153,6 +160,7 @@ def test_from_unity_cables_are_out_of_reach_and_the_status_says_so(floors):
     assert solution.record.status != "converged"
 
 
+@pytest.mark.chain
 def test_interference_that_is_not_flagged_is_not_said_to_have_converged():
     """A thousand times the signal in one channel, different on every baseline: no gains can stand for it."""
     simulation, problem = Hard(RANDOM, cables=300e-9, fault="interference").simulate()

@@ -20,6 +20,7 @@ from calstudy.calibrate.solvers.interface import solve, solve_warm
 from calstudy.calibrate.tensors import FitTensors, GainSpace
 
 
+@pytest.mark.chain
 def test_solvers_meet_where_no_direction_is_flat():
     """Foregrounds with as much of every sequence keep gains and foregrounds apart: there is but one minimum."""
     toy = make_toy(scattered(8))
@@ -66,6 +67,7 @@ def test_coordinates_of_smooth_gains_are_adjoint():
 
 
 @pytest.mark.parametrize("solver", ["gauss-newton", "adamax"])
+@pytest.mark.chain
 def test_smooth_gains_stay_smooth_and_fit_as_well(solver):
     toy, vectors = smooth_toy()
     problem = toy.problem(replace(toy.structure, gain_vectors=vectors), prior="none")

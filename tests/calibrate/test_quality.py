@@ -194,6 +194,7 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(files, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.chain
 def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives(files, capsys, monkeypatch):
     assert run_command(capsys, *CALIBRATE, "--output", "whole")[0] == 0
     solves = []

@@ -40,6 +40,7 @@ def test_gauss_newton_converges(converged):
     assert solution.record.steps == solution.record.loss_history.size - 1
 
 
+@pytest.mark.chain
 def test_adamax_descends_to_the_same_minimum(converged):
     problem, best = converged
     from_unity = solve(problem, Adamax(learning_rate=3e-3, max_steps=8000, precision="double"))
@@ -356,6 +357,7 @@ def golomb(**case):
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-6])
+@pytest.mark.chain
 def test_single_precision_says_where_it_does_not_reach(noise):
     """An array without redundancy and little noise: `converged` would be a tenth and more above the minimum."""
     simulation, structure = golomb(noise=noise)

@@ -279,6 +279,7 @@ def test_a_file_may_hold_gains_for_every_integration(template, rng, tmp_path):
     assert np.array_equal(draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))["gains"], gains)
 
 
+@pytest.mark.chain
 def test_a_run_with_drifting_gains_is_compared_with_the_gains_of_each_integration(tmp_path):
     """The complete sky model recovers gains that change by a third between two integrations, and the flux scale.
 

@@ -51,6 +51,7 @@ def test_counts_find_a_population_as_drawn_and_one_that_is_too_bright():
     assert len(draw_counts(counts).axes) == 2
 
 
+@pytest.mark.chain
 def test_the_smooth_fit_is_nearest_to_the_table():
     fit = compare_interpolations(InstrumentSettings(), step=16)
     assert fit.fit_max.max() < 5e-4
@@ -60,6 +61,7 @@ def test_the_smooth_fit_is_nearest_to_the_table():
     assert len(draw_interpolations(fit).axes[0].lines) == 5
 
 
+@pytest.mark.chain
 def test_a_smooth_beam_has_the_lowest_floor():
     experiment = validate(SMALL, Path())
     floors = compare_floors(experiment.instrument, experiment.sky, experiment.simulation)

@@ -104,6 +104,7 @@ def test_it_is_drawn_into_the_run_folder_with_its_caption_in_the_order_of_the_fi
     assert f"{NAME}</strong>: {CAPTION}" in (finished.folder / "report.html").read_text()
 
 
+@pytest.mark.chain
 def test_an_installed_one_is_used_by_its_name(folder, finished, monkeypatch, tmp_path):
     point = "calstudy.figures: retained-power = retained_power_package:RetainedPower"
     install(monkeypatch, tmp_path, "retained_power_package", CODE, point, "1.0")

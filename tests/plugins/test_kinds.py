@@ -97,6 +97,7 @@ def test_one_figure_is_drawn_of_each_member_and_of_all(finished):
         np.testing.assert_array_equal(arrays(part.folder)["all"], whole[label])
 
 
+@pytest.mark.chain
 def test_members_share_the_products_that_do_not_depend_on_what_differs(finished):
     one, two = ({task.key for task in part.tasks if task.stage.name == "simulate"} for part in finished.parts.values())
     assert len(one & two) == 1

@@ -24,6 +24,7 @@ CHANNELS = Channels(first="120.3 MHz", width="600 kHz", count=100)
 LINE = LinearLayout(kind="linear", count=4, spacing="33 m")
 
 
+@pytest.mark.chain
 def test_every_solver_is_timed_as_often_as_asked():
     found = time_steps(LINE, CHANNELS, BasisSettings(), Samples(steps=13, calls=3, solves=2), "cpu")
     counts = {name: len(samples) for name, samples in found.seconds.items()}

@@ -85,6 +85,7 @@ def misaligned(gaussian_beam, dipole_beam):
 
 
 @pytest.mark.parametrize("engine", FAST_ENGINES)
+@pytest.mark.chain
 def test_engines_agree_on_misaligned_antennas(engine, misaligned):
     template = observe(count=5, channels=2, times=1)
     sky = random_sky(template, count=40)

@@ -100,6 +100,7 @@ def test_every_member_gets_its_own_folder_and_the_collection_another(finished, c
     assert made == {f"{name}.{ending}" for name in PAIR["figures"] for ending in ("png", "pdf", "npz")}
 
 
+@pytest.mark.chain
 def test_the_combined_figure_shows_the_tables_of_the_members(finished):
     with np.load(finished.folder / "figures" / "spherical-comparison.npz") as shown:
         for role, member in (("minimally_redundant", "hexagon"), ("redundant", "redundant")):

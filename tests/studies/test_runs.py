@@ -65,6 +65,7 @@ def stages_made(result: Run) -> set[str]:
     return {task.stage.name for task in result.made.tasks}
 
 
+@pytest.mark.chain
 def test_a_run_leaves_figures_tables_manifest_and_a_file_that_reads_back(finished):
     names = {path.name for path in (finished.folder / "figures").iterdir()}
     figures, endings = load_tiny(finished).outputs.figures, ("png", "pdf", "npz")
@@ -190,6 +191,7 @@ def command(path: Path, *options: str) -> list[str]:
     return [sys.executable, "-m", "calstudy", "run", str(path), *options]
 
 
+@pytest.mark.chain
 def test_a_killed_run_resumes_and_ends_as_if_it_had_not_been(finished, tmp_path):
     path = tmp_path / "tiny.yaml"
     path.write_text(yaml.safe_dump(of_the_paper(tmp_path)))
