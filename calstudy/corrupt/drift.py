@@ -113,13 +113,17 @@ class _Drift(Section, ABC):
     )
     seed: int = Field(50, ge=0, description="Together with the seed of the effect.")
 
-    def factors(self, observation: Observation, effect_seed: int) -> np.ndarray:
+    def stream(self, effect_seed: int | None) -> int | tuple[int, int]:
+        """Return what seeds the drift of an effect with a seed, or of one that draws nothing."""
+        # NumPy ignores zeros at the end of a list, which gives the stream of the number without them.
+        return (self.seed, effect_seed) if effect_seed else self.seed
+
+    def factors(self, observation: Observation, effect_seed: int | None) -> np.ndarray:
         """Return the factors of the gains, complex128, shape (Nants, Nfreqs or 1, Ntimes, Npols).
 
         Drifts of two effects are independent if their seeds or the seeds of the effects differ.
         """
-        # A list of seeds gives another stream than any single number does.
-        random = np.random.default_rng([self.seed, effect_seed])
+        random = np.random.default_rng(self.stream(effect_seed))
         seconds = (observation.times - observation.times[0]) * SECONDS_PER_DAY
         if isinstance(self.channels, str):
             n_processes = observation.n_channels if self.channels == "independent" else 1

@@ -135,7 +135,7 @@ class GainEffect(Effect):
                 f"{sizes} (antennas, channels, times, polarizations), or of one time for constant ones"
             )
         if self.drift is not None:
-            gains = gains * self.drift.factors(observation, getattr(self, "seed", 0))
+            gains = gains * self.drift.factors(observation, getattr(self, "seed", None))
         if not np.isfinite(gains).all() or (gains == 0).any():
             raise InputError(f"effect {self.label!r}: its gains are zero or not finite somewhere")
         return {"gains": gains.astype(np.complex128)}

@@ -46,7 +46,7 @@ class CorruptionSettings(Section):
             own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
             seeds = [("seed", own, own)]
             if drift is not None:
-                seeds.append(("drift.seed", drift.seed, (drift.seed, own)))
+                seeds.append(("drift.seed", drift.seed, drift.stream(own)))
             for name, seed, identity in seeds:
                 if identity is not None and identity in seen:
                     raise fault(

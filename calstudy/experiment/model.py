@@ -258,7 +258,10 @@ class Experiment(Section):
         drawn: list[tuple[str, int | None]] = [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
         drawn += [("corruption.noise", seed) for seed in {*even_and_odd, *twins}]
         for place, effect in enumerate(self.corruption.effects):
-            drawn.append((f"corruption.effects.{place}.seed", getattr(effect, "seed", None)))
+            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
+            drawn.append((f"corruption.effects.{place}.seed", own))
+            if drift is not None and isinstance(stream := drift.stream(own), int):
+                drawn.append((f"corruption.effects.{place}.drift.seed", stream))
         for number, (path, seed) in enumerate(drawn):
             for other, its in drawn[:number]:
                 # Effects are compared with each other, and with their drifts, by `CorruptionSettings`.

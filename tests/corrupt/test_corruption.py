@@ -236,6 +236,20 @@ def test_positions_and_effects_with_one_seed_are_refused(tmp_path):
             },
             "is 9, as that of instrument.as_built.positions",
         ),
+        # A drift of an effect that draws nothing, or has a seed of zero, has the stream of its own seed.
+        (
+            {"corruption.effects": [{"kind": "bandpass", "seed": 0, "drift": {"kind": "jumps", "seed": 4}}]},
+            r"effects\.0\.drift\.seed: is 4, as that of corruption.noise",
+        ),
+        (
+            {
+                "corruption.effects": [
+                    {"kind": "per-channel-gains", "seed": 8},
+                    {"kind": "bandpass", "seed": 0, "drift": {"kind": "jumps", "seed": 8}},
+                ]
+            },
+            r"effects\.1\.drift\.seed: is 8, as that of item 0",
+        ),
         ({"corruption.noise.seeds_without_eor": [4, 3]}, "has the seed of even data where seeds has that of odd"),
     ],
 )
