@@ -71,12 +71,7 @@ def _drawn(experiment: Experiment, draws: Mapping[str, int]) -> Experiment:
     sky, corruption = experiment.sky, experiment.corruption
     eor = sky.eor.model_copy(update={"seed": sky.eor.seed + SEED_STEP * draws["eor"]})
     changes: dict[str, Any] = {
-        "effects": tuple(
-            effect.model_copy(update={"seed": seed + SEED_STEP * draws["gains"]})
-            if (seed := _gain_seed(effect)) is not None
-            else effect
-            for effect in corruption.effects
-        )
+        "effects": tuple(_with_gains_drawn(effect, SEED_STEP * draws["gains"]) for effect in corruption.effects)
     }
     if not isinstance(corruption.noise, NoNoise):
         noise = corruption.noise
@@ -90,8 +85,19 @@ def _drawn(experiment: Experiment, draws: Mapping[str, int]) -> Experiment:
 
 
 def _gain_seed(effect: Any) -> int | None:
-    """Return the seed of an effect on the gains; None if it has none, or is an effect of another kind."""
-    return getattr(effect, "seed", None) if isinstance(effect, GainEffect) else None
+    """Return the seed of an effect on the gains, or else of its drift; None without any, or for other effects."""
+    if not isinstance(effect, GainEffect):
+        return None
+    return getattr(effect, "seed", None if effect.drift is None else effect.drift.seed)
+
+
+def _with_gains_drawn(effect: Any, step: int) -> Any:
+    """Return an effect whose gains have other seeds, larger by a step."""
+    if (seed := _gain_seed(effect)) is None:
+        return effect
+    if hasattr(effect, "seed"):
+        return effect.model_copy(update={"seed": seed + step})
+    return effect.model_copy(update={"drift": effect.drift.model_copy(update={"seed": seed + step})})
 
 
 def _faults(experiment: Experiment) -> list[str]:
@@ -112,7 +118,9 @@ def _faults(experiment: Experiment) -> list[str]:
     if "noise" in drawn and isinstance(experiment.corruption.noise, NoNoise):
         faults.append("realizations: draw 'noise', but corruption.noise is 'none'")
     if "gains" in drawn and all(_gain_seed(effect) is None for effect in experiment.corruption.effects):
-        faults.append("realizations: draw 'gains', but no effect on the gains in corruption.effects has a seed")
+        faults.append(
+            "realizations: draw 'gains', but no effect on the gains in corruption.effects, nor a drift, has a seed"
+        )
     return faults or _coinciding_seeds(experiment)
 
 

@@ -92,6 +92,13 @@ def test_realizations_differ_in_the_drawn_seeds_alone(folder):
     assert all(item == others[0] for item in others)
 
 
+def test_gains_of_a_file_are_drawn_again_by_their_drift(folder):
+    (folder / "x.calh5").touch()
+    data = override(small(folder), "corruption.effects", [{"kind": "file-gains", "path": "x.calh5", "drift": "jumps"}])
+    drifts = [item.experiment.corruption.effects[0].drift for item in expand_realizations(validate(data, folder))]
+    assert [drift.seed for drift in drifts] == [50, 60, 70]
+
+
 def test_a_realization_has_the_products_of_the_experiment_with_these_seeds_in_its_file(folder):
     """The same keys, so that a run of either finds what the other made."""
     data = small(folder, sky__eor__seed=12, corruption__noise__seeds=[13, 14])
