@@ -337,7 +337,7 @@ def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Tas
     return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
 
 
-class Claims(Task, stage="claims", version=13, cost=Cost(1, disk=1e5)):
+class Claims(Task, stage="claims", version=14, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
 
     papers: Sequence[Any]

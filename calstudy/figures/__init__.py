@@ -248,7 +248,7 @@ def _listed(kinds: Sequence[str]) -> str:
     return f"for {' or '.join(kinds)} files"
 
 
-class Draw(Task, stage="figure", version=4):
+class Draw(Task, stage="figure", version=5):
     """One figure; `own` are the settings of its own, which are keyed beside the others."""
 
     figure: StudyFigure

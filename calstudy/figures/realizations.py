@@ -124,12 +124,14 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
 
 
 def _draw_coverage(axes: Axes, results: RegionResults) -> None:
-    """Draw the part of the realizations whose 95 % bars cover, per bin; filled: of P^R / T."""
+    """Draw the part of independent draws whose 95 % bars cover, per bin; filled: of P^R / T."""
     pooled = results.pooled
     for kind, (marker, colour, name, shift) in KINDS.items():
         k = pooled.k + shift * np.diff(pooled.bin_edges)
         for prefix, filled, power in (("", "none", "P^R"), ("corrected_", colour, "P^R/T")):
-            inside = results.covered.get(prefix + kind, np.full((1, pooled.k.size), np.nan))
+            inside = results.trials(prefix + kind)
+            if inside is None:
+                continue
             known = np.isfinite(inside).all(axis=0)
             part, label = inside[:, known].mean(axis=0), rf"${power}$ of ${name}$"
             axes.plot(k[known], part, marker, color=colour, markerfacecolor=filled, label=label)

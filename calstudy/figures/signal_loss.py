@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 
 
-TRANSFER = r"$T = P^{R}/P^{S}$"
+TRANSFER = r"$T = P^{D}/P^{S}$"
 SCALE_FREE = "outside, free of the flux scale {:.3f}"
 MAP_COLOURS = "cividis"
 EMPTY = "0.8"
@@ -137,7 +137,10 @@ class SignalLossFigure(StudyFigure):
 
     kind: str = "signal-loss"
 
-    caption = "What the calibration leaves of the EoR: T = P^R / P^S, per k and per baseline length and delay."
+    caption = (
+        "What the calibration leaves of the EoR: T = P^D / P^S of the part D of the residual that the EoR makes, per k "
+    )
+    "and per baseline length and delay."
     variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True
     needs_calibration = True

@@ -136,7 +136,8 @@ class TransferFunction:
         T s^2, the transfer function free of the flux scale, and its standard deviation, (Nk,); NaN if s is not known.
     squared_coherence, squared_coherence_error
         C^2 / T, which does not depend on the scale of the gains, and its standard deviation, (Nk,). For spectra of each
-        baseline with itself it is the fraction of the power that is retained.
+        baseline with itself it is the fraction of the power that is retained, but where power leaks in from other
+        delays, as next to the wedge.
     signal : sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins
     n_samples : baselines, or redundant groups, in each bin, (Nk,) int
     flux_scale : s: fitted gain products over the true ones; NaN if not known

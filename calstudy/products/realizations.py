@@ -238,10 +238,15 @@ class RegionResults:
 
     def coverage(self, kind: str, bins: np.ndarray) -> Finding | None:
         """Return the coverage in some bins over the block with independent trials; None without such a block."""
+        trials = self.trials(kind)
+        return None if trials is None else coverage(trials[:, bins], independent=True)
+
+    def trials(self, kind: str) -> np.ndarray | None:
+        """Return which realizations of the block with independent trials cover, (K, Nk); None without such a block."""
         place = self.pooled.design.block_of(DRAWN_FOR[kind.removeprefix("corrected_")])
         if place is None or kind not in self.covered:
             return None
-        return coverage(self.covered[kind][list(self.pooled.design.blocks[place][1])][:, bins], independent=True)
+        return self.covered[kind][list(self.pooled.design.blocks[place][1])]
 
     def corrected_over(self, power: np.ndarray, bins: np.ndarray, known_scale: bool = False) -> Finding | None:
         """Return the mean of P^R / T over another power, (K, Nk), in some bins; None where T is not known.

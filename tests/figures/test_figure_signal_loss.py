@@ -107,7 +107,8 @@ def test_axes_have_units(loss):
     figure = draw_signal_loss(loss)
     left, right = figure.axes[:2]
     assert "Mpc" in left.get_xlabel()
-    assert "P^{S}" in left.get_ylabel()
+    # Of the part of the residual that the EoR makes, not of all of it.
+    assert left.get_ylabel() == "$T = P^{D}/P^{S}$"
     assert "Mpc" in right.get_xlabel()
 
 

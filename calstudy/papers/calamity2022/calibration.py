@@ -33,9 +33,7 @@ def gains_within_20_percent(run: Results) -> Finding:
     return _median(run, "gains_aligned")
 
 
-@RESULTS.states(
-    GAINS, "rms of g - ĝ over rms of g, gains as fitted from a start at unity; median", AtMost(0.2), "≲ 20 %"
-)
+@RESULTS.states(GAINS, "rms of g - ĝ over rms of g, gains as fitted; median", AtMost(0.2), "≲ 20 %")
 def gains_within_20_percent_raw(run: Results) -> Finding:
     return _median(run, "gains_raw")
 

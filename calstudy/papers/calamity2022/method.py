@@ -67,7 +67,8 @@ def vectors_like_bandwidth_of_basis(run: Results) -> Finding:
 
 
 @METHOD.states(
-    "doing this limits any increases in variance and signal loss to the foreground wedge",
+    "doing this, instead of sky-based modeling, ignores correlations between the baselines and limits any increases in "
+    "variance and signal loss, to the foreground wedge",
     "1 - C²/T, the part of the EoR that is lost outside the wedge at k >= 0.5",
     AtMost(HUNDREDTH),
     "none, to a hundredth",

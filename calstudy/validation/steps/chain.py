@@ -21,9 +21,10 @@ The spectrum of the EoR alone is followed through the chain, with each entry in 
 - *mask*: modes outside the wedge in place of all modes of the band;
 - *left*: the residual without EoR, noise and foregrounds, which is in P^R but is no signal (negative).
 
-The end-to-end loss is measured separately: P_in - P^R, from the residual of the whole chain. The sum must agree
-with it. The difference is the cross term of the EoR's response and the residual without EoR. Its mean is zero, and its
-error comes from leaving out antennas (`calstudy.power.clusters`).
+Each stage starts from the power that the one before leaves, so that the sum is P_in less the power of the response D
+less that of the residual without EoR, whatever the single entries are. It must agree with the end-to-end loss, P_in -
+P^R of the whole chain: the difference is the cross term of the EoR's response and the residual without EoR. Its mean is
+zero, and its error comes from leaving out antennas (`calstudy.power.clusters`). The budget itself is reported.
 """
 
 from __future__ import annotations
@@ -139,13 +140,12 @@ class SignalLossBudget(Step):
 
     kind: str = "signal-loss-budget"
     number = "4.1"
-    proves = "the EoR losses of all stages add up to the end-to-end loss"
+    proves = "the residual is the response to the EoR, and what is left without it, with no power in common"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
     sections: ClassVar = ("instrument", "power", "sky")
     limits: ClassVar = {
         "minredundant_worst_pull": Limit(
-            "minimally redundant array, |sum of the stages - end-to-end loss| in sigma; largest value of all bands of "
-            "k",
+            "minimally redundant array, |P^R - P^D - P^R without EoR| in sigma; largest value of all bands of k",
             AtMost(3),
             "within the errors; 3 sigma, for the largest of four bands",
         ),

@@ -196,7 +196,6 @@ class GainErrors(Step):
         return Findings(values, (remark,))
 
 
-SUPPRESSION = 100
 NOISE_SIGMAS = 2
 WIDTH = 2
 """Reflections are searched for within this many standard deviations of their mean delay."""
@@ -214,8 +213,8 @@ SMALL = {
 class LowSnr(Step):
     """The remaining artefact at the reflections' delays, outside the wedge.
 
-    With means over those bins, weighted by their inverse noise variance, *left* is |P^R| over the larger of P^V / 100
-    and 2 sigma of the noise: one or less is suppression by 100, or to the noise.
+    With means over those bins, weighted by their inverse noise variance, *left* is |P^R| over 2 sigma of the noise: one
+    or less is suppression to the noise.
     """
 
     kind: str = "low-snr"
@@ -225,9 +224,9 @@ class LowSnr(Step):
     sections: ClassVar = ("corruption",)
     limits: ClassVar = {
         "left": Limit(
-            "|P^R| at the reflections over the larger of P^V / 100 and 2 sigma of the noise",
+            "|P^R| at the reflections over 2 sigma of the noise",
             AtMost(1),
-            "suppressed by 100, or to the noise",
+            "consistent with the noise",
         ),
     }
 
@@ -249,7 +248,7 @@ class LowSnr(Step):
             float(np.sum(weights * spectrum.power.real[chosen]) / weights.sum()) for spectrum in (corrupted, residual)
         )
         sigma = float(weights.sum() ** -0.5)
-        allowed = max(abs(artefact) / SUPPRESSION, NOISE_SIGMAS * sigma)
+        allowed = NOISE_SIGMAS * sigma
         values = {
             "left": Finding(abs(left) / allowed, sigma / allowed),
             "left_sigmas": Finding(left / sigma, 1.0),
