@@ -119,7 +119,7 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
     axes.set_yscale("symlog", linthresh=3)
     bottom = min(-3.0, axes.get_ylim()[0])
     axes.set_yticks([-10, -3, -2, -1, 0, 1, 2, 3], ["−10", "−3", "−2", "−1", "0", "1", "2", "3"])
-    axes.set(ylabel="pull: mean and scatter", ylim=(bottom, max(3.0, axes.get_ylim()[1])))
+    axes.set(ylabel="pull: mean and scatter\n(linear to ±3)", ylim=(bottom, max(3.0, axes.get_ylim()[1])))
     _legend_above(axes, 1)
 
 

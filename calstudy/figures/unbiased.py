@@ -109,7 +109,7 @@ def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
         left.errorbar(k, np.abs(power), yerr=SIGMAS_95 * error, **bars)
         left.plot(k[power < 0], -power[power < 0], marker, color=colour, markerfacecolor="white")
     left.plot([], [], color=style.BAND, linewidth=3, label="$P^S$")
-    left.set(xlabel=style.WAVENUMBER, ylabel=rf"$P$ ({style.POWER_UNIT})", yscale="log", xlim=(0, found.bin_edges[-1]))
+    left.set(xlabel=style.WAVENUMBER, ylabel=rf"$P$ ({style.POWER_UNIT}), 95 % bars", yscale="log", xlim=(0, found.bin_edges[-1]))
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=3)
     known = np.isfinite(found.power)
     for window, total in zip(found.window[known], found.flat_transfer[known], strict=True):
@@ -131,7 +131,7 @@ def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> Figure:
         for axes, (name, found) in zip(row, calibrators.items(), strict=False):
             _draw_routes(axes, found)
             axes.set_title(f"{name}, {world}")
-        row[0].set_ylabel(r"$P\,/\,P^{S}$")
+        row[0].set_ylabel(r"$P\,/\,P^{S}$, 95 % bars")
     for axes in grid[-1]:
         axes.set_xlabel(style.WAVENUMBER)
     handles, labels = grid[0, 0].get_legend_handles_labels()
