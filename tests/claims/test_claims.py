@@ -83,6 +83,7 @@ def test_all_claims_of_the_minimally_redundant_array_hold_in_the_papers_world(ma
         (
             {"recovered": 0.2},
             {
+                "calibrated-window-consistent",
                 "residual-level-outside-wedge",
                 "residual-agrees-outside-wedge",
                 "residual-unbiased-outside-wedge",
