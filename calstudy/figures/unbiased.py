@@ -109,7 +109,12 @@ def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
         left.errorbar(k, np.abs(power), yerr=SIGMAS_95 * error, **bars)
         left.plot(k[power < 0], -power[power < 0], marker, color=colour, markerfacecolor="white")
     left.plot([], [], color=style.BAND, linewidth=3, label="$P^S$")
-    left.set(xlabel=style.WAVENUMBER, ylabel=rf"$P$ ({style.POWER_UNIT}), 95 % bars", yscale="log", xlim=(0, found.bin_edges[-1]))
+    left.set(
+        xlabel=style.WAVENUMBER,
+        ylabel=rf"$P$ ({style.POWER_UNIT}), 95 % bars",
+        yscale="log",
+        xlim=(0, found.bin_edges[-1]),
+    )
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=3)
     known = np.isfinite(found.power)
     for window, total in zip(found.window[known], found.flat_transfer[known], strict=True):

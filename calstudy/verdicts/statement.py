@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from calstudy.base.errors import InputError
-from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
+from calstudy.verdicts.criterion import Criterion, Equal, Finding, Outcome, Threshold, Verdict
 
 SIGMAS = 2.0
 """Half the width of a 95 % interval, in standard deviations."""
@@ -71,6 +71,10 @@ class Statement(Criterion):
 
     def _verdict(self, finding: Finding | None, outcome: Outcome, runs: Sequence[str], reason: str) -> Verdict:
         verdict = super()._verdict(finding, outcome, runs, reason)
+        if isinstance(self.threshold, Equal):
+            # No interval lies within a single number.
+            exact = f"exactly {self.threshold.target:.3g}, which errors can only contradict"
+            verdict = replace(verdict, threshold=exact)
         undecided = finding is not None and outcome == "undecided" and finding.kind in ("error", "scatter")
         return replace(
             verdict,
