@@ -140,7 +140,7 @@ class SignalLossBudget(Step):
 
     kind: str = "signal-loss-budget"
     number = "4.1"
-    proves = "the residual is the response to the EoR, and what is left without it, with no power in common"
+    proves = "P^R is P^D and the residual without EoR, with no cross term"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
     sections: ClassVar = ("instrument", "power", "sky")
     limits: ClassVar = {
