@@ -87,6 +87,10 @@ class Frame:
         """Baseline lengths, m, (Nbls,)."""
         return read_only(np.linalg.norm(self.vectors, axis=1))
 
+    def antennas_of(self, used: np.ndarray) -> np.ndarray:
+        """Return which antennas are in any of the used baselines: bool, (Nants, ...), of a mask (Nbls, ...)."""
+        return np.stack([used[(self.antennas == row).any(axis=1)].any(axis=0) for row in range(self.n_antennas)])
+
     def baselines(self, chosen: np.ndarray) -> Frame:
         """Return the same with some of the baselines, selected by a bool array (Nbls,)."""
         kept, antennas = np.unique(self.antennas[chosen], return_inverse=True)

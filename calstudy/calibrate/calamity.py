@@ -81,7 +81,7 @@ def fit(
             continue
         model[times, :, :, p] = solution.model.reshape(-1, *shape[1:3])
         for t in range(times.start, times.stop):
-            gain_flags[:, :, t, p] = ~_has_data(prepared.structure, prepared.weights[t, :, :, p] > 0)
+            gain_flags[:, :, t, p] = ~prepared.data.antennas_of(prepared.weights[t, :, :, p] > 0)
             gains[:, :, t, p] = np.where(gain_flags[:, :, t, p], 1, solution.gains)
     return Calibration(
         gains=gains,
@@ -267,11 +267,3 @@ def _scale(solution: Solution, problem: CalibrationProblem) -> dict[str, float]:
     if slope == 0:
         return {}
     return {"sky_model_slope": slope, "band_shape_rms": float(np.sqrt(np.nanmean((shape - 1) ** 2)))}
-
-
-def _has_data(structure: FitStructure, used: np.ndarray) -> np.ndarray:
-    """Return the antennas and channels, (Nants, Nfreqs), with any baseline in use; `used` is (Nbls, Nfreqs)."""
-    found = np.zeros((structure.n_antennas, structure.n_frequencies), bool)
-    for column in structure.antennas.T:
-        np.logical_or.at(found, column, used)
-    return found

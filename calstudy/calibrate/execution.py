@@ -363,7 +363,11 @@ class _Returned:
         return outcomes
 
     def result(self, usage: Usage) -> CalibrationResult:
-        """Return gains, model and residual as standard objects, with the records of all solves."""
+        """Return gains, model and residual as standard objects, with the records of all solves.
+
+        A gain is flagged where its antenna has no data, in a channel of an integration: no unflagged sample of any
+        fitted baseline. That holds for every calibrator, and also if integrations with data share the gain.
+        """
         flags = np.array(self.fitted.flags)
         if self.returned.flags is not None:
             excluded = np.asarray(self.returned.flags)
@@ -377,7 +381,7 @@ class _Returned:
             if not outcome.usable:
                 p, group = divmod(index, len(self.groups))
                 flags[self.groups[group], :, :, p] = True
-                self.gain_flags[:, :, self.groups[group], p] = True
+        self.gain_flags |= ~self.fitted.antennas_of(np.moveaxis(~flags, 0, 2))
         gains = np.where(self.gain_flags, 1, self.gains)
         if self.calibrator.smooth_gains is not None:
             gains = smooth(gains, self.gain_flags, self.fitted, self.numbers, self.calibrator.smooth_gains)

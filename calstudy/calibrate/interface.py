@@ -69,7 +69,8 @@ class Calibration:
         How the solves ended: one for each polarization and each group of integrations, polarization by polarization,
         each in the order of time; or a single one for all of them.
     gain_flags
-        Mask of gains that must not be used, bool, like `gains`; None for none, or for those of the UVCal.
+        Mask of gains that must not be used, bool, like `gains`; None for none, or for those of the UVCal. Gains of
+        antennas without data in a channel of an integration are flagged anyhow.
     model
         The foregrounds F, (Ntimes, Nbls, Nfreqs, Npols), in the unit of the data; None for the sky model.
     flags

@@ -123,7 +123,8 @@ class CalibrationResult:
     ----------
     gains
         Gains g of each antenna, channel and integration, gain convention ``divide``: V = g_a g_b* m. Flagged where
-        an antenna has no data in a channel, and where a solve was skipped or failed; unity there.
+        an antenna has no data in a channel of an integration, even if it shares its gain with others, and where a solve
+        was skipped or failed; unity there.
     model : the intrinsic foregrounds F, in the unit of the data, times the closure factors c_ab if there are any
     residual : R = V / (c_ab g_a g_b*) - F, zero where flagged
     solutions : one record per solve, polarization by polarization, each in the order of time

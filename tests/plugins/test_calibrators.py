@@ -16,6 +16,7 @@ from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.calibrate.calibrators.given_gains import NoCalibration
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.files import dump, load
@@ -234,6 +235,32 @@ def test_flagged_gains_flag_what_they_calibrate(observed, tmp_path):
     assert flags.sum() == data.Ntimes * first.sum()
     assert np.isfinite(result.residual.data_array).all()
     assert not result.residual.data_array[result.residual.flag_array].any()
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_gains_of_antennas_without_data_are_flagged(observed, tmp_path, own):
+    """By no calibrator's own doing: here all gains are known, or one."""
+    data, sky = observed
+    data, numbers = data.copy(), data.telescope.antenna_numbers
+    flags = data.flag_array.reshape(data.Ntimes, data.Nbls, data.Nfreqs)
+    ends = np.stack([data.ant_1_array, data.ant_2_array])[:, : data.Nbls]
+    flags[0, (ends == numbers[2]).any(axis=0), 3:] = True
+    # One baseline is enough.
+    flags[0, (ends == numbers[4]).any(axis=0).nonzero()[0][1:]] = True
+    flags[1, :, 5] = True
+    result = run_calibrator(known_gains(tmp_path) if own else NoCalibration(), data, sky)
+    expected = np.zeros((data.Ntimes, len(numbers), data.Nfreqs), bool)
+    expected[0, 2, 3:], expected[1, :, 5] = True, True
+    np.testing.assert_array_equal(np.moveaxis(result.gains.flag_array[..., 0], 2, 0), expected)
+    np.testing.assert_array_equal(result.residual.flag_array, data.flag_array)
+
+
+def test_nothing_is_fitted_or_calibrated_where_all_is_flagged(observed):
+    data, sky = observed
+    data = data.copy()
+    data.flag_array[data.Nbls :] = True
+    result = run_calibrator(NoCalibration(), data, sky)
+    assert [record.status for record in result.solutions] == ["converged", "skipped"]
 
 
 @pytest.mark.parametrize("status", ["failed", "skipped"])

@@ -91,7 +91,7 @@ class Ddecal(OtherPackage):
         order = np.argsort([int(name) for name in table.antennas])
         gains = table.gains[order, :, : len(groups), 0]
         # A solution without data is one, NaN, or a copy of the previous solution.
-        known = [_antennas_with_weight(measured, times) for times in groups]
+        known = [measured.frame.antennas_of((measured.weights[times] > 0).any(axis=0)) for times in groups]
         return np.where(np.stack(known, axis=2), gains, np.nan), self._outcomes(ended.stdout, len(groups))
 
     def _run(self, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -153,15 +153,6 @@ def _program() -> str | None:
             if (command := shutil.which(name, path=path)) is not None:
                 return command
     return None
-
-
-def _antennas_with_weight(measured: Measured, times: slice) -> np.ndarray:
-    """Return the mask of antennas and channels with data, bool, (Nants, Nfreqs)."""
-    used = (measured.weights[times] > 0).any(axis=0)
-    known = np.zeros((measured.frame.n_antennas, used.shape[1]), bool)
-    for ends in measured.frame.antennas.T:
-        np.logical_or.at(known, ends, used)
-    return known
 
 
 def _write_measurement_set(folder: Path, measured: Measured, groups: list[slice]) -> None:

@@ -59,8 +59,12 @@ class NoCalibration(Calibrator):
         count = n_polarizations * len(self.solves(n_times))
         if progress is not None:
             progress(count, count)
-        outcome = Solve(status="converged", message="gains of one: nothing is fitted")
-        return Calibration(gains=gains, outcomes=[outcome] * count)
+        found = Solve(status="converged", message="gains of one: nothing is fitted")
+        nothing = Solve(status="skipped", message="every sample is flagged")
+        empty = [
+            observation.flags[times, ..., p].all() for p in range(n_polarizations) for times in self.solves(n_times)
+        ]
+        return Calibration(gains=gains, outcomes=[nothing if flagged else found for flagged in empty])
 
 
 class ByFile(Calibrator):
