@@ -1,4 +1,4 @@
-"""Read single antennas and baselines from products; of several polarizations, the first."""
+"""Read single antennas and baselines from products; of several polarizations, by default the first."""
 
 from __future__ import annotations
 
@@ -61,17 +61,19 @@ class AlignedGains:
         return np.searchsorted(self.numbers, numbers)
 
 
-def read_gains(folder: Path) -> Gains:
-    """Read the gains of a product of stage `gains` or `calibrate`."""
+def read_gains(folder: Path, polarization: int = 0) -> Gains:
+    """Read the gains of a product of stage `gains` or `calibrate`, of one polarization by its place."""
     cal = UVCal.from_file(folder / GAINS)
     order = np.argsort(cal.ant_array)
-    values, flags = (np.moveaxis(array[order][..., 0], 2, 0) for array in (cal.gain_array, cal.flag_array))
+    values, flags = (np.moveaxis(array[order][..., polarization], 2, 0) for array in (cal.gain_array, cal.flag_array))
     return Gains(cal.ant_array[order], cal.freq_array, values, flags)
 
 
-def true_of(true: Path | None, fitted: Gains) -> np.ndarray:
+def true_of(true: Path | None, fitted: Gains, polarization: int = 0) -> np.ndarray:
     """Read the true gains of the antennas and integrations of fitted ones; unity without a product of such gains."""
-    return np.ones(fitted.values.shape) if true is None else read_gains(true).over(len(fitted.values), fitted.numbers)
+    if true is None:
+        return np.ones(fitted.values.shape)
+    return read_gains(true, polarization).over(len(fitted.values), fitted.numbers)
 
 
 def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGains:

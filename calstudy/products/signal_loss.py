@@ -97,7 +97,14 @@ def _flux_scale(graph: Graph) -> Task:
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
     even, odd = (calibration.calibration(graph, residual, parity) for parity in PARITIES)
     gains = corruption.gains(graph) if residual.effects else None
-    return FluxScale("flux scale", taper=graph.experiment.power.taper, even=even, odd=odd, gains=gains)
+    return FluxScale(
+        "flux scale",
+        taper=graph.experiment.power.taper,
+        polarizations=len(graph.experiment.instrument.polarizations),
+        even=even,
+        odd=odd,
+        gains=gains,
+    )
 
 
 class TransferTable(StudyTable):
@@ -249,24 +256,34 @@ class SweepSummary(Task, stage="sweep-summary", version=1, cost=Cost(1, disk=1e5
 
 
 class FluxScale(Task, stage="flux-scale", version=1):
-    """The flux scale of a calibration."""
+    """The flux scale of a calibration, of all polarizations, as are the spectra that it multiplies.
+
+    Several used to have the scale of the first; their number, which is in the key unless it is one, tells them apart.
+    """
 
     taper: str
+    polarizations: int = 1
     even: Input
     odd: Input
     gains: Input = None
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the flux scale of the first polarization, null if it is not known, to scale.json."""
-        from calstudy.products.selection import read_gains, true_of
-
-        ratios = []
-        for folder in (self.even, self.odd):
-            fitted = read_gains(folder)
-            ratios.append(gain_ratio(true_of(self.gains, fitted), np.where(fitted.flags, np.nan, fitted.values)))
-        scale = flux_scale(ratios[0], ratios[1], make_taper(self.taper, fitted.frequency.size) ** 2)
+        """Write the flux scale, null if it is not known, to scale.json."""
+        even, odd = (
+            np.concatenate([self._ratio(folder, polarization) for polarization in range(self.polarizations)])
+            for folder in (self.even, self.odd)
+        )
+        scale = flux_scale(even, odd, make_taper(self.taper, even.shape[1]) ** 2)
         write_json(output / SCALE, {"flux_scale": json_number(scale)})
         return {}
+
+    def _ratio(self, calibration: Path, polarization: int) -> np.ndarray:
+        """Return true over fitted gain products of one polarization, (Npairs, Nfreqs)."""
+        from calstudy.products.selection import read_gains, true_of
+
+        fitted = read_gains(calibration, polarization)
+        true = true_of(self.gains, fitted, polarization)
+        return gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values))
 
     def _cost(self) -> Cost:
         return Cost(0.5 + size_of(self).samples * 2.5e-7, disk=1e3)

@@ -7,13 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from observations import small_instrument
 from small_chain import ANTENNAS, VARIANTS, small
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.experiment.files import dump, load, validate
+from calstudy.base.gains import make_uvcal
+from calstudy.experiment.files import dump, load, override, validate
+from calstudy.instrument.telescope import make_template
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction, TransferMap, pool
-from calstudy.products.signal_loss import transfer
+from calstudy.products.files import GAINS, read_json
+from calstudy.products.graph import Graph, required
+from calstudy.products.signal_loss import SCALE, FluxScale, transfer
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.kinds.sweep import Sweep, expand
 from calstudy.studies.load import load_study
@@ -60,6 +65,31 @@ def test_inside_the_modelled_delays_nothing_is_left(swept):
     modelled = found.delay <= np.maximum(found.horizon_delay, 100e-9)[:, None]
     assert np.mean(found.cross_transfer[modelled]) < 0.1
     assert np.mean(found.cross_transfer[found.delay > 900e-9 + 0 * found.cross_transfer]) > 0.4
+
+
+def test_the_flux_scale_is_of_all_polarizations_and_of_no_flagged_gain(tmp_path):
+    """Gains of yy are larger by 21 %; those of an antenna without data are flagged, and may be anything."""
+    template = make_template(small_instrument(polarizations=["xx", "yy"]))
+    gains = np.ones((template.telescope.Nants, template.Nfreqs, template.Ntimes, 2), complex)
+    gains[..., 1], gains[3] = 1.1, 1e3
+    flags = np.zeros(gains.shape, bool)
+    flags[3] = True
+    make_uvcal(template, gains, flags).write_calh5(tmp_path / GAINS)
+    scales = []
+    for polarizations in (1, 2):
+        task = FluxScale("", taper="blackman-harris", polarizations=polarizations, even=tmp_path, odd=tmp_path)
+        task.make(tmp_path)
+        scales.append(read_json(tmp_path / SCALE)["flux_scale"])
+    assert scales == pytest.approx([1, np.mean([1, 1.1**-4]) ** -0.5], rel=1e-9)
+
+
+def test_two_polarizations_have_another_flux_scale_than_one(tmp_path):
+    one, two = (
+        required(transfer(Graph(validate(override(small(tmp_path), "instrument.polarizations", chosen), tmp_path))))
+        for chosen in (["xx"], ["xx", "yy"])
+    )
+    assert "polarizations" not in one.scale.settings
+    assert two.scale.settings["polarizations"] == 2
 
 
 def test_a_larger_buffer_loses_more(swept):
