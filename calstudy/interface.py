@@ -67,6 +67,8 @@ if TYPE_CHECKING:
 
 Half = Literal["even", "odd"]
 REGIONS = ("outside-wedge", "inside-wedge")
+SMOOTHING = ("smooth_gains", "gain_delay", "smoothness")
+"""Fields of calibrators that make gains smooth."""
 
 
 def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
@@ -170,8 +172,14 @@ class CalibratedData:
         """Return the gains with a draw of their errors, for errors of baselines that were not fitted.
 
         The noise of fitted baselines is not independent of that of their gains, and needs no draws. Raises InputError
-        if the calibration has no errors.
+        if the calibration has no errors, or smooth gains: draws are independent by channel, and such errors are not.
         """
+        if smoothed := [name for name in SMOOTHING if self.solution["settings"].get(name) is not None]:
+            raise InputError(
+                f"calibration.{smoothed[0]} = {self.solution['settings'][smoothed[0]]!r}: gains are smooth, so that "
+                "their errors are not independent by channel and integration, as those that are drawn are; calibrate "
+                f"with {smoothed[0]}: null to draw errors"
+            )
         records = self.solution["records"]
         solves = [slice(at := record["integration"], at + record["n_integrations"]) for record in records]
         return draw_gains(self.gains, read_gain_errors(self.folder / GAINS), solves, seed)

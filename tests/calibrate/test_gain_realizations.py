@@ -120,3 +120,19 @@ def test_fits_with_a_taper_have_them_by_realizations_alone(calibrated):
     without = calibrated("matrix", True, **settings).solution["records"][0]["gain_errors"]
     assert without == {"reason": "weights with a taper are no inverse variances of the noise"}
     assert calibrated("realizations", 2, **settings).solution["records"][0]["gain_errors"]["realizations"] == 2
+
+
+SMOOTH = [
+    ("smooth_gains", {"calibrator": "skycal", "smooth_gains": {"kind": "dpss", "frequency_scale": "2 MHz"}}),
+    ("gain_delay", {"calibrator": "sky-based", "gain_delay": "400 ns"}),
+]
+
+
+@pytest.mark.parametrize(("field", "settings"), SMOOTH)
+@pytest.mark.filterwarnings("ignore")
+def test_errors_of_smooth_gains_are_not_drawn_for_each_channel_by_itself(calibrated, field, settings):
+    found = calibrated("smooth", 2, weights="flags", **settings)
+    with pytest.raises(InputError, match=rf"calibration\.{field} = .*: gains are smooth, .* with {field}: null"):
+        found.draw_gains(1)
+    rough = calibrated("rough", 2, weights="flags", calibrator=settings["calibrator"])
+    assert (rough.draw_gains(1).gain_array != rough.gains.gain_array).any()
