@@ -11,7 +11,7 @@ from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.identity import identity
-from calstudy.base.observation import Observation
+from calstudy.base.observation import Frame, Observation
 from calstudy.corrupt.effects.additive import Crosstalk, MutualCoupling
 from calstudy.corrupt.interface import apply_effect, draw_truth
 from calstudy.experiment.files import dump, override, validate
@@ -20,6 +20,7 @@ from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.telescope import make_template
 from calstudy.products.corruption import read_truth, truths
 from calstudy.products.graph import Graph
+from calstudy.simulate.source_sums import PairSums
 from calstudy.studies.load import load_study
 
 
@@ -48,7 +49,7 @@ def test_coupling_is_the_sum_over_all_third_antennas(observed, cube, autos):
 
     def coefficient(i, k, channel):
         length = np.linalg.norm(positions[i] - positions[k])
-        phase = truth["phase"][i, k] - 2 * np.pi * nu[channel] * length / speed_of_light
+        phase = truth["phase"][i, k] + 2 * np.pi * nu[channel] * length / speed_of_light
         return 0.03 * (14 / length) ** 1.5 * np.exp(1j * phase)
 
     def visibility(i, j, time, channel, polarization):
@@ -69,6 +70,40 @@ def test_coupling_is_the_sum_over_all_third_antennas(observed, cube, autos):
             assert found[place[0], index[i, j], place[1], place[2]] == pytest.approx(expected, rel=1e-10)
 
 
+class AllSky:
+    """A beam of one everywhere, for the sums of the simulator."""
+
+    n_feeds = 1
+
+    def at(self, azimuth, zenith_angle):
+        return np.ones((1, CHANNELS.size, azimuth.size))
+
+
+CHANNELS = np.linspace(170e6, 172e6, 50)
+
+
+def test_what_an_antenna_passes_on_arrives_after_what_it_received():
+    """A source on the western horizon, three antennas from west to east, and coupling of the first two alone.
+
+    What the first passes on goes along with the direct wave, and reaches the second together with it in every channel.
+    What the second passes back reaches the first late by the way there and back, as by a cable of that delay, which
+    turns gains and V_ab by exp(2 pi i nu tau) (`calstudy.calibrate.delay_start`).
+    """
+    positions, pairs = np.array([[0.0, 0, 0], [100, 0, 0], [200, 0, 0]]), np.array([[0, 1], [0, 2], [1, 2]])
+    frame = Frame(np.arange(3), positions, pairs, CHANNELS)
+    delays, index = positions / speed_of_light, np.zeros(3, int)
+    simulator = PairSums(delays, tuple(pairs.T), CHANNELS, [AllSky()], index, np.float64)
+    direct = simulator.at(np.array([[-1.0], [0], [0]]), np.zeros(3), np.ones((CHANNELS.size, 1)))
+    direct = direct.transpose(2, 0, 1)[None]
+    effect = MutualCoupling(amplitude=0.01, autos=None)
+    truth = draw_truth(effect, frame)
+    truth["phase"][:], truth["modulus"][2], truth["modulus"][:, 2] = 0, 0, 0
+    added = apply_effect(effect, direct.copy(), frame, truth) / direct - 1
+    np.testing.assert_allclose(added[0, 2, :, 0], truth["modulus"][0, 1], atol=1e-9)
+    cable = np.exp(2j * np.pi * CHANNELS * 200 / speed_of_light)
+    np.testing.assert_allclose(added[0, 1, :, 0], truth["modulus"][0, 1] * cable, atol=1e-9)
+
+
 def test_coupling_is_the_first_order_of_voltages_that_antennas_share(observed, rng):
     """v_i + sum_k e_ik v_k correlated: what is left over is of second order in e."""
     samples = 400
@@ -85,7 +120,7 @@ def test_coupling_is_the_first_order_of_voltages_that_antennas_share(observed, r
         effect = MutualCoupling(amplitude=amplitude, autos=None)
         truth = draw_truth(effect, observed)
         turns = truth["delay"] * observed.frequencies[:, None, None]
-        matrix = truth["modulus"] * np.exp(1j * (truth["phase"] - 2 * np.pi * turns))
+        matrix = truth["modulus"] * np.exp(1j * (truth["phase"] + 2 * np.pi * turns))
         pairs, cube = correlated(voltages)
         cube = np.repeat(cube, 2, axis=-1)
         found = apply_effect(effect, cube.copy(), observed, truth)[0, ..., 0]

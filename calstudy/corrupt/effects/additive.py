@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 class Crosstalk(Effect):
     """A term in every baseline that is constant in time: c exp(-2 pi i nu tau), with c complex normal, tau normal.
 
-    Kern et al. (2019) found such terms in HERA, at delays of cables.
+    Kern et al. (2019) found such terms in HERA, at delays of cables. All baselines (a, b), with a before b in the order
+    of antennas, have theirs at tau and none at -tau, as if a leaked into b, and b not into a: results depend on that
+    order.
     """
 
     uses_positions: ClassVar[bool] = False
@@ -59,10 +61,14 @@ class Crosstalk(Effect):
 class MutualCoupling(Effect):
     """First-order coupling: V_ij becomes V_ij + sum_k (e_ik V_kj + e_jk* V_ik) (Josaitis et al. 2022).
 
-    e_ik = e_ki = amplitude (distance / |b_ik|)^falloff exp[i (phi_ik - 2 pi nu |b_ik| / c)], with phi_ik uniform. The
-    terms with k = j and k = i have the autocorrelations of the antennas, which simulations do not have.
+    e_ik = e_ki = amplitude (distance / |b_ik|)^falloff exp[i (phi_ik + 2 pi nu |b_ik| / c)], with phi_ik uniform. The
+    sign of the delay, which is that of the code of that paper, makes the signal of k late in i: like gains,
+    visibilities V_ij turn by exp(2 pi i nu tau) where antenna i is late by tau. The terms with k = j and k = i have the
+    autocorrelations of the antennas, which simulations do not have.
     """
 
+    # What antennas receive from each other is late by the way of light since 2; before, it was early.
+    version: ClassVar[int] = 2
     kind: str = "mutual-coupling"
     amplitude: float = Field(
         1e-3,
@@ -111,7 +117,7 @@ class MutualCoupling(Effect):
         ):
             raise InputError("corruption.effects: mutual-coupling: needs the baselines of all pairs of antennas")
         turns = truth["delay"] * observation.frequencies[:, None, None]
-        coefficients = truth["modulus"] * np.exp(1j * (truth["phase"] - 2 * np.pi * turns))
+        coefficients = truth["modulus"] * np.exp(1j * (truth["phase"] + 2 * np.pi * turns))
         pairs = np.zeros((observation.n_channels, count, count), complex)
         if self.autos is not None:
             pairs[:, range(count), range(count)] = self.autos.jansky(observation.frequencies)[:, None]
