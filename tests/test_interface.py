@@ -1,7 +1,9 @@
 """The Python interface returns what the files of a run hold, with labels and units."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -77,6 +79,16 @@ def test_spectra_are_those_of_the_tables(run):
     assert found.attrs["wedge_excluded"]
     with pytest.raises(KeyError, match="residual"):
         run.spectra["residuel"]
+
+
+def test_the_example_of_the_page_compares_with_the_truth_without_a_unit(run):
+    page = (Path(__file__).parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+    *lines, last = re.findall(r"```python\n(.*?)```", page, re.DOTALL)[-1].splitlines()
+    names = {"run": run}
+    exec("\n".join(lines), names)
+    assert np.isfinite(eval(last, names).item())
+    assert names["pull"].attrs["units"] == ""
+    assert names["pull"].k.attrs["units"] == "h/Mpc"
 
 
 def test_cylindrical_spectra_have_lengths_and_delays(run):
