@@ -140,6 +140,15 @@ class CalibrationResult:
         """The solves that did not reach the minimum."""
         return tuple(record for record in self.solutions if record.status not in SETTLED)
 
+    def solved_gains(self, solve: Solve, rows: np.ndarray, place: int) -> np.ndarray:
+        """Return the gains of a solve, (len(rows), Nfreqs): each of an integration in which it is not flagged.
+
+        Rows are places of antennas, and `place` is that of the polarization. Unity where all integrations are flagged.
+        """
+        times = slice(solve.integration, solve.integration + solve.n_integrations)
+        gains, flags = (array[rows, :, times, place] for array in (self.gains.gain_array, self.gains.flag_array))
+        return np.take_along_axis(gains, flags.argmin(axis=2)[..., None], axis=2)[..., 0]
+
     def summary(self) -> dict[str, Any]:
         """Return the number of solves by status, total seconds, and every record, as plain JSON types."""
         statuses = [record.status for record in self.solutions]

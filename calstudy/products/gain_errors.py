@@ -125,7 +125,7 @@ class OfSolves(Calibrated):
         for solve in result.solutions:
             times = slice(solve.integration, solve.integration + solve.n_integrations)
             place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
-            gains = result.gains.gain_array[rows, :, times.start, place]
+            gains = result.solved_gains(solve, rows, place)
             problem = problem_at(prepared, settings, times, place, gains, solve)
             found: GainErrors | str
             if not solve.usable:
@@ -152,10 +152,11 @@ class OfSolves(Calibrated):
         return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
-class ErrorsOfGains(OfSolves, stage="gain-errors", version=6):
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=7):
     """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged.
 
-    Since version 6 fits with a taper have no errors by their matrix.
+    Since version 6 fits with a taper have no errors by their matrix. Since version 7 integrations without data, which
+    share gains with others, have no errors and do not count.
 
     If no solve has errors by its own matrix, they come from fits to this many `realizations` of the noise, unless it is
     zero.
@@ -191,6 +192,7 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=6):
             # Gains that are given, and not fitted.
             errors[..., ~(errors > 0).any(axis=(0, 1, 2))] = np.nan
             records = [self._by_realizations(result, errors, solve) for solve in result.solutions]
+        errors[:, result.gains.flag_array] = np.nan
         result.gains.write_calh5(output / GAINS)
         if np.isfinite(errors).any():
             write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay, used))
@@ -211,7 +213,8 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=6):
     def _by_realizations(self, result: CalibrationResult, errors: np.ndarray, solve: Solve) -> dict[str, Any]:
         """Return the record of a solve whose errors are from realizations."""
         place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
-        at = (slice(None), slice(None), solve.integration, place)
+        times = slice(solve.integration, solve.integration + solve.n_integrations)
+        at = (slice(None), slice(None), times, place)
         if not np.isfinite(errors[0][at]).any():
             flagged = result.gains.flag_array[at].all()
             return {"reason": "all gains are flagged" if flagged else "gains do not change with the noise of the data"}

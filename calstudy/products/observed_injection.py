@@ -341,7 +341,7 @@ class _OfData(Task):
         times = slice(record.integration, record.integration + record.n_integrations)
         prepared = prepared_fit(self.calibrator, *read_observed(self.data, self.calibrator, self.sky_model))
         rows = positions(result.gains.ant_array, prepared.data.numbers)
-        gains = result.gains.gain_array[rows, :, times.start, polarization]
+        gains = result.solved_gains(record, rows, polarization)
         problem = problem_at(prepared, self.calibrator, times, polarization, gains, record)
         if isinstance(problem, str):
             return None

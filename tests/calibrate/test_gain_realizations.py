@@ -122,6 +122,22 @@ def test_fits_with_a_taper_have_them_by_realizations_alone(calibrated):
     assert calibrated("realizations", 2, **settings).solution["records"][0]["gain_errors"]["realizations"] == 2
 
 
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("realizations", [True, 8])
+def test_an_integration_without_data_changes_no_errors_of_gains_that_it_shares(calibrated, realizations):
+    """Gains are flagged there, and have no errors; those of the integration with data are as if it were alone."""
+    taper = {} if realizations is True else {"baselines": {"taper": "1 km"}}
+    settings = {"calibrator": "sky-based", "weights": "flags", "flagged": slice(0, 1), **taper}
+    shared = calibrated("shared", realizations, integrations_per_solve=2, **settings)
+    alone = calibrated("alone", realizations, **settings)
+    for part in ("amplitude", "phase"):
+        found, expected = (getattr(one.gain_errors, part).values for one in (shared, alone))
+        assert np.isnan(found[:, :, 0]).all()
+        np.testing.assert_allclose(found[:, :, 1], expected[:, :, 1], rtol=0.01)
+    (record,) = shared.solution["records"]
+    assert record["gain_errors"].get("median_phase") == pytest.approx(NOISE / np.sqrt(2 * 7), rel=0.5)
+
+
 SMOOTH = [
     ("smooth_gains", {"calibrator": "skycal", "smooth_gains": {"kind": "dpss", "frequency_scale": "2 MHz"}}),
     ("gain_delay", {"calibrator": "sky-based", "gain_delay": "400 ns"}),

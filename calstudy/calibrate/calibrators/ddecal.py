@@ -91,7 +91,7 @@ class Ddecal(OtherPackage):
         order = np.argsort([int(name) for name in table.antennas])
         gains = table.gains[order, :, : len(groups), 0]
         # A solution without data is one, NaN, or a copy of the previous solution.
-        known = [measured.frame.antennas_of((measured.weights[times] > 0).any(axis=0)) for times in groups]
+        known = [measured.frame.antennas_of(measured.weights[times].max(axis=0) > 0) for times in groups]
         return np.where(np.stack(known, axis=2), gains, np.nan), self._outcomes(ended.stdout, len(groups))
 
     def _run(self, folder: Path) -> subprocess.CompletedProcess[str]:
