@@ -79,6 +79,13 @@ class DelaySpectra:
         """Number of baselines of each unit, (Nu,): one that is crossed with itself, or n with n (n - 1) pairs."""
         return np.where(self.n_pairs == 1, 1.0, (1 + np.sqrt(1 + 4 * self.n_pairs)) / 2)
 
+    def antennas_of_units(self) -> list[tuple[int, ...]]:
+        """Return the antennas of each unit, ascending: two for one baseline; none where shares are not known."""
+        members: list[set[int]] = [set() for _ in self.n_pairs]
+        for unit, antenna in zip(self.share_unit.tolist(), self.share_antenna.tolist(), strict=True):
+            members[unit].add(antenna)
+        return [tuple(sorted(found)) for found in members]
+
     def pairs_of_units(self) -> list[tuple[object, ...]]:
         """Return a key of each unit: its vector to a mm, and the number of its pairs that contain each antenna."""
         members: list[list[tuple[int, int]]] = [[] for _ in self.n_pairs]

@@ -238,8 +238,11 @@ def read_observed(folder: Path, calibrator: Calibrator, sky_model: bool) -> tupl
     return read_visibilities(folder / DATA), sky, noise
 
 
-class ObservedAverage(InBlocks, stage="observed-average", version=1):
-    """The average of one half; all averages have the samples, flags and baselines of the residual."""
+class ObservedAverage(InBlocks, stage="observed-average", version=2):
+    """The average of one half; all averages have the samples, flags and baselines of the residual.
+
+    Noise is known where the autocorrelations tell that of some of the samples since version 2, not only of all.
+    """
 
     what: str
     data: Input

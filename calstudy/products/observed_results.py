@@ -16,6 +16,7 @@ from calstudy.base.table import Table
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
 from calstudy.power.binned import cylindrical_average, modes_in_bins, noise_error, spherical_average, with_errors
+from calstudy.power.spectra import of_common_units
 from calstudy.power.tables import save_spectrum, write_csv
 from calstudy.products.calibration import prepared_fit, read_result
 from calstudy.products.files import DATA, read_json, read_visibilities, spectrum_file, write_json
@@ -83,8 +84,11 @@ class ObservedTable(StudyTable):
         return [observed_spectra(graph), quality(graph)]
 
 
-class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, disk=5e6)):
-    """Wedge and spherical spectra; errors are those of the noise, from the difference of halves on each baseline."""
+class ObservedSpectra(Task, stage="observed-spectra", version=2, cost=Cost(10, disk=5e6)):
+    """Wedge and spherical spectra; errors are those of the noise, from the difference of halves on each baseline.
+
+    Baselines of the same vector have their own noise since version 2, and are in one bin of length.
+    """
 
     power: PowerSettings
     delays: Inputs
@@ -92,28 +96,30 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectra as HDF5 and CSV, and the level of the noise to noise.json."""
         delays = {name: read_delay_spectra(folder) for name, folder in self.delays.items()}
-        levels = {
-            what: {source: _levels(delays, what, source, self.power.wedge_buffer) for source in SOURCES}
-            for what in ("data", "residual")
-        }
+        buffer, noises = self.power.wedge_buffer, {}
+        for what in ("data", "residual"):
+            named = {source: f"noise of {what} from {source}" for source in SOURCES}
+            noises[what] = {source: delays[name] for source, name in named.items() if name in delays}
         for what in WHAT:
             if not np.isfinite(delays[what].power).any():
                 raise InputError(f"{what}: all data are flagged, because no solve of the calibration gave gains")
             save_spectrum(output / spectrum_file(what, "wedge"), cylindrical_average(delays[what], self.power))
-            noise = "data" if what == "data" else "residual"
-            level = next((found for found in levels[noise].values() if found is not None), None)
-            if level is None:
+            known = [
+                (noise, level)
+                for source, noise in noises["data" if what == "data" else "residual"].items()
+                if (level := _levels(noise, source, buffer)) is not None
+            ]
+            if not known:
                 raise InputError(
                     "power.wedge_buffer: no baseline has delays beyond |b|/c + buffer, from which the noise would be "
                     "known; use a smaller one, or data with autocorrelations"
                 )
-            spectra = self._spherical(delays[what], delays[f"noise of {noise} from {SOURCES[0]}"], level)
-            for modes, spectrum in spectra.items():
+            for modes, spectrum in self._spherical(delays[what], *known[0]).items():
                 save_spectrum(output / spectrum_file(what, modes), spectrum)
                 write_csv(output / f"{what}.{modes}.csv", spectrum)
         noise_file = output / spectrum_file("noise", "wedge")
-        save_spectrum(noise_file, cylindrical_average(delays[f"noise of residual from {SOURCES[0]}"], self.power))
-        summary = {what: _summary(**found) for what, found in levels.items()}
+        save_spectrum(noise_file, cylindrical_average(noises["residual"][SOURCES[0]], self.power))
+        summary = {what: _summary(found, buffer) for what, found in noises.items()}
         write_json(output / NOISE_SUMMARY, summary)
         return {"noise": summary}
 
@@ -121,10 +127,9 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
         """Return the level of the noise."""
         rows = []
         for what, levels in read_json(folder / NOISE_SUMMARY).items():
-            ratio = levels.get("difference_over_autos")
             powers = ("" if levels[source] is None else f"{levels[source]:.3g}" for source in SOURCES)
             name = "data as given" if what == "data" else what
-            rows.append((name, *powers, "" if ratio is None else f"{ratio['mean']:.3f} ± {ratio['error']:.3f}"))
+            rows.append((name, *powers, _shown(levels.get("difference_over_autos"))))
         return [Table(NOISE_COLUMNS, rows, "Noise of the measured data", NOISE_NOTE)]
 
     def _spherical(self, spectra: DelaySpectra, noise: DelaySpectra, level: np.ndarray) -> dict[str, SphericalSpectrum]:
@@ -139,32 +144,51 @@ class ObservedSpectra(Task, stage="observed-spectra", version=1, cost=Cost(10, d
         return found
 
 
-def _levels(delays: Mapping[str, DelaySpectra], what: str, source: str, buffer: float) -> np.ndarray | None:
-    """Return P_N of each baseline, or None if it is not known from this source."""
+def _levels(noise: DelaySpectra, source: str, buffer: float) -> np.ndarray | None:
+    """Return P_N of each baseline, or None if it is not known of any."""
     from calstudy.realdata.noise import noise_of_baselines
 
-    name = f"noise of {what} from {source}"
-    if name not in delays:
-        return None
-    found = noise_of_baselines(delays[name], buffer, everywhere=source == "autos")
+    found = noise_of_baselines(noise, buffer, everywhere=source == "autos")
     return found if np.isfinite(found).any() else None
 
 
-def _summary(difference: np.ndarray | None, autos: np.ndarray | None) -> dict[str, Any]:
-    """Return the mean P_N over baselines from each source, and the ratio of the two."""
+def _summary(noises: Mapping[str, DelaySpectra], buffer: float) -> dict[str, Any]:
+    """Return the mean P_N over baselines from each source, and the ratio of the two on the baselines of both.
+
+    What is not known is None: a mean of no baseline, and the error of a single one.
+    """
     found: dict[str, Any] = {}
-    for name, levels in (("difference", difference), ("autos", autos)):
-        found[name] = None if levels is None else float(np.nanmean(levels))
-    if difference is not None and autos is not None:
-        ratio = difference / autos
-        ratio = ratio[np.isfinite(ratio)]
-        found["difference_over_autos"] = {
+    for source in SOURCES:
+        level = _levels(noises[source], source, buffer) if source in noises else None
+        found[source] = None if level is None else float(np.nanmean(level))
+    if None in found.values():
+        return found
+    try:
+        common = of_common_units(noises)
+    except InputError:
+        return found | {"difference_over_autos": None}
+    # A baseline that both have may have no delays beyond the buffer.
+    levels = [_levels(common[source], source, buffer) for source in SOURCES]
+    ratio = np.zeros(0) if levels[0] is None or levels[1] is None else levels[0] / levels[1]
+    ratio = ratio[np.isfinite(ratio)]
+    return found | {
+        "difference_over_autos": {
             "mean": float(ratio.mean()),
-            "error": float(ratio.std() / math.sqrt(ratio.size)),
+            "error": float(ratio.std() / math.sqrt(ratio.size)) if ratio.size > 1 else None,
             "lowest": float(ratio.min()),
             "highest": float(ratio.max()),
         }
-    return found
+        if ratio.size
+        else None
+    }
+
+
+def _shown(ratio: Mapping[str, float | None] | None) -> str:
+    """Return the text of a ratio with its error; empty without any."""
+    if ratio is None:
+        return ""
+    error = ratio["error"]
+    return f"{ratio['mean']:.3f} " + ("(error not known)" if error is None else f"± {error:.3f}")
 
 
 class ObservedQuality(Task, stage="observed-quality", version=1):

@@ -22,10 +22,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
+from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.spectra import DelaySpectra, outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
+
+SAME_VECTOR = 1e-3
+"""Baselines whose vectors differ by less, m, are redundant without a doubt."""
 
 
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
@@ -91,16 +95,18 @@ def _weights(uvd: UVData) -> np.ndarray:
 
 
 def noise_of_average(variance: np.ndarray, uvd: UVData, times: np.ndarray) -> np.ndarray:
-    """Return sigma of the average over some integrations, (Nbls, Nfreqs, Npols); NaN where nothing is unflagged.
+    """Return sigma of the average over some integrations, (Nbls, Nfreqs, Npols); NaN where no variance is known.
 
-    `variance` is sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols); the numbers of samples in `uvd` are the
-    weights. `times` are indices of integrations, (n,).
+    `variance` is sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols), NaN where it is not known: there it is taken to
+    be the mean of the known ones. The numbers of samples in `uvd` are the weights, of unflagged samples only. `times`
+    are indices of integrations, (n,).
     """
     weights = np.where(flag_cube(uvd), 0, uvd.nsample_array.reshape(variance.shape))[times]
     variance = variance[times]
-    total = weights.sum(axis=0)
-    added = np.sum(np.where(weights > 0, weights**2 * variance, 0), axis=0)
-    return np.sqrt(np.divide(added, total**2, out=np.full(total.shape, np.nan), where=total > 0))
+    known = np.where(np.isfinite(variance), weights, 0)
+    squares, total = np.sum(known**2, axis=0), weights.sum(axis=0)
+    mean = np.sum(np.where(known > 0, known**2 * variance, 0), axis=0) / np.where(squares > 0, squares, np.nan)
+    return np.sqrt(mean * np.sum(weights**2, axis=0)) / np.where(total > 0, total, np.nan)
 
 
 def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> np.ndarray:
@@ -119,12 +125,19 @@ def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> 
 def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarray) -> np.ndarray:
     """Return P_N of each unit of spectra (baseline or redundant group), (Nu,): the mean over its baselines.
 
-    `noise` gives the vectors of the baselines, and `levels` P_N of each; NaN is left out.
+    `noise` gives the baselines, and `levels` P_N of each. NaN is left out; units without levels have the mean of all.
+    Baselines are told by their antennas, and those of groups, or of spectra without shares, by their vectors.
     """
     known = np.isfinite(levels)
-    both = np.concatenate([spectra.vectors, -spectra.vectors])
-    unit = cKDTree(both).query(noise.vectors[known])[1] % len(spectra.vectors)
-    count = np.bincount(unit, minlength=len(spectra.vectors))
-    total = np.bincount(unit, levels[known], len(spectra.vectors))
     mean = np.mean(levels[known]) if known.any() else np.nan
-    return np.divide(total, count, out=np.full(count.size, mean), where=count > 0)
+    units = spectra.antennas_of_units()
+    if all(len(antennas) == 2 for antennas in units):
+        level = dict(zip(noise.antennas_of_units(), np.where(known, levels, mean).tolist(), strict=True))
+        return np.array([level.get(antennas, mean) for antennas in units])
+    both = np.concatenate([spectra.vectors, -spectra.vectors])
+    # Units of the same vector, which only spectra without shares have, cannot be told apart: they have one level.
+    group = redundant_groups(spectra.vectors, SAME_VECTOR).index
+    place = group[cKDTree(both).query(noise.vectors[known])[1] % len(group)]
+    count = np.bincount(place, minlength=len(group))
+    total = np.bincount(place, levels[known], len(group))
+    return np.divide(total, count, out=np.full(count.size, mean), where=count > 0)[group]

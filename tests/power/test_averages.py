@@ -19,6 +19,10 @@ from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, delay_spectra, outside_wedge
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
+from calstudy.products.observed import WHAT
+from calstudy.products.observed_results import ObservedSpectra
+from calstudy.products.spectra import DELAY_SPECTRA
+from calstudy.realdata.noise import noise_of_average, noise_of_units
 
 SETTINGS = PowerSettings(bins=KBins(max="2.0 h/Mpc", width="0.1 h/Mpc"))
 FREQUENCY, WIDTH, OMEGA_PP = 182e6, 80e3, 0.07
@@ -323,6 +327,80 @@ def test_noise_power_from_visibilities_has_its_known_level(observe, white, beam)
         uvp = estimate_power(white(template, rng, 7.0), white(template, rng, 7.0), beam, settings)
         level = binned.noise_level(delay_spectra(uvp, settings))
         assert level == pytest.approx(p_noise / np.sqrt(2), rel=0.08)
+
+
+@pytest.mark.parametrize("shares", [True, False])
+def test_baselines_of_the_same_vector_have_their_own_noise(observe, white, beam, shares):
+    """Without shares, by which antennas are known, they have the mean of those of their vector."""
+    template, rng = observe(HexLayout(kind="hex", side=3), n_channels=8), np.random.default_rng(4)
+    settings = PowerSettings(pairs="same-baseline")
+    whole = delay_spectra(estimate_power(white(template, rng), white(template, rng), beam, settings), settings)
+    # A baseline without spectra, and one whose noise is not known.
+    noise, spectra = whole, whole.of_units(np.arange(1, len(whole.n_pairs)))
+    level = np.arange(len(whole.n_pairs)) + 1.0
+    level[7] = np.nan
+    if shares:
+        expected = np.where(np.isnan(level), np.nanmean(level), level)[1:]
+    else:
+        empty = {name: np.zeros(0, int) for name in ("share_unit", "share_antenna", "share_pairs")}
+        noise, spectra = (dataclasses.replace(one, **empty) for one in (noise, spectra))
+        places = np.rint(whole.vectors).astype(int)
+        places *= np.where(places[:, 0] != 0, np.sign(places[:, 0]), np.sign(places[:, 1]))[:, None]
+        same = (places[:, None] == places).all(axis=2)
+        expected = np.array([np.nanmean(level[row]) for row in same])[1:]
+    np.testing.assert_allclose(noise_of_units(spectra, noise, level), expected)
+
+
+def test_redundant_groups_have_the_mean_noise_of_their_baselines(observe, white, beam):
+    template, rng = observe(HexLayout(kind="hex", side=2), n_channels=8), np.random.default_rng(4)
+    data = white(template, rng)
+    noise, groups = (
+        delay_spectra(estimate_power(data, data, beam, settings), settings)
+        for settings in (PowerSettings(pairs="same-baseline"), PowerSettings(pairs="redundant-group"))
+    )
+    # The spacing is 14 m. The baselines of 28 m have no partner.
+    level = np.where(noise.length > 27, np.nan, noise.length**2)
+    found = noise_of_units(groups, noise, level)
+    np.testing.assert_allclose(found, groups.length**2, rtol=1e-3)
+
+
+def test_noise_of_an_average_is_that_of_the_samples_whose_variance_is_known(observe, white):
+    template = observe(HexLayout(kind="hex", side=2), n_channels=8, n_times=5)
+    data = white(template, np.random.default_rng(1))
+    shape = (5, template.Nbls, 8, 1)
+    variance, flags = np.full(shape, 9.0), np.zeros(shape, bool)
+    variance[0, 1] = variance[:, 2] = np.nan
+    flags[1, 3] = flags[:, 4] = True
+    data.flag_array = flags.reshape(data.flag_array.shape)
+    data.nsample_array[:] = 2.0
+    found = noise_of_average(variance, data, np.arange(5))
+    np.testing.assert_allclose(found[[0, 1]], 3 / np.sqrt(5))
+    np.testing.assert_allclose(found[3], 3 / np.sqrt(4))
+    assert np.isnan(found[[2, 4]]).all()
+
+
+@pytest.mark.parametrize(("last", "first", "told"), [(10, 4, " ± "), (7, 6, " (error not known)"), (5, 5, "")])
+def test_noise_from_two_sources_is_compared_on_the_baselines_of_both(tmp_path, observe, white, beam, last, first, told):
+    """Flagged autocorrelations leave baselines without noise from them."""
+    template, rng = (
+        observe(MwaLayout(kind="mwa-compact-minredundant", count=5), n_channels=64),
+        np.random.default_rng(4),
+    )
+    settings, data = PowerSettings(pairs="same-baseline", wedge_buffer="0 ns"), white(template, rng)
+    whole = delay_spectra(estimate_power(data, data, beam, settings), settings)
+    known = {"difference": whole.of_units(np.arange(last)), "autos": whole.of_units(np.arange(first, 10))}
+    delays = dict.fromkeys(WHAT, whole)
+    delays |= {f"noise of {what} from {name}": one for what in ("data", "residual") for name, one in known.items()}
+    for name, spectra in delays.items():
+        (tmp_path / name).mkdir()
+        save_spectrum(tmp_path / name / DELAY_SPECTRA, spectra)
+    task = ObservedSpectra("spectra", power=settings, delays={name: tmp_path / name for name in delays})
+    ratio = task.make(tmp_path)["noise"]["data"]["difference_over_autos"]
+    assert (ratio is None) == (first >= last)
+    (table,) = task.shown(tmp_path)
+    # Powers of the same white data, outside the wedge and everywhere.
+    assert ratio is None or ratio["mean"] == pytest.approx(1, abs=0.2)
+    assert all(told in row[-1] and bool(told) == bool(row[-1]) for row in table.rows)
 
 
 def test_tables_come_back(tmp_path):
