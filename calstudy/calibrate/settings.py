@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.base.schema import REVISED, UNKEYED, Section, choice, fault
@@ -158,8 +159,11 @@ Weights = Annotated[
 class BaselineRange(Section):
     """Baselines that gains are fitted to. Gains calibrate all baselines of their antennas."""
 
-    shortest: Length = Field(0.0, ge=0, description="Shorter baselines have no weight.")
-    longest: Length | None = Field(None, gt=0, description="Longer baselines have no weight; null: all have.")
+    # Baselines that are as long as these but for rounding were left out until 2.
+    shortest: Length = Field(0.0, ge=0, description="Shorter baselines have no weight.", json_schema_extra={REVISED: 2})
+    longest: Length | None = Field(
+        None, gt=0, description="Longer baselines have no weight; null: all have.", json_schema_extra={REVISED: 2}
+    )
     taper: Length | None = Field(
         None,
         gt=0,
@@ -180,7 +184,8 @@ class BaselineRange(Section):
 
         Where all factors of an antenna are below `LEAST_TAPER` they are zero: a fit converges before its gains move.
         """
-        chosen = (lengths >= self.shortest) & (lengths <= (math.inf if self.longest is None else self.longest))
+        longest = math.inf if self.longest is None else self.longest
+        chosen = (lengths >= self.shortest - SAME_LENGTH) & (lengths <= longest + SAME_LENGTH)
         factors = chosen * (1.0 if self.taper is None else np.exp(-((lengths / self.taper) ** 2) / 2))
         largest = np.zeros(antennas.max() + 1)
         for column in antennas.T:

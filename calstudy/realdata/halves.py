@@ -17,7 +17,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.settings import Channels, Size
-from calstudy.realdata.selection import Selection, parse_values, select
+from calstudy.realdata.selection import SAME_FREQUENCY, Selection, between, parse_values, select
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -251,9 +251,9 @@ def interleaved(data: UVData, parity: str) -> UVData:
 
 def flag_channels(data: UVData, text: str) -> None:
     """Flag the channels in a range such as ``149.7 MHz..150.2 MHz``; raise InputError if it holds no channel."""
-    low, high = parse_values({"frequencies": text}, "observed.flag: ").frequencies or (None, None)
+    ends = parse_values({"frequencies": text}, "observed.flag: ").frequencies or (None, None)
     frequencies = np.ravel(data.freq_array)
-    chosen = (frequencies >= (low or -np.inf)) & (frequencies <= (high or np.inf))
+    chosen = between(frequencies, ends, SAME_FREQUENCY)
     if not chosen.any():
         raise InputError(
             f"observed.flag: {text!r} has no channel of the data, which have {frequencies.min() / 1e6:.3f} to "

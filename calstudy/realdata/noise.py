@@ -21,15 +21,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
+from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.visibilities import antenna_pairs, flag_cube, rows_of, to_cube
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.spectra import DelaySpectra, outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
-
-SAME_VECTOR = 1e-3
-"""Baselines whose vectors differ by less, m, are redundant without a doubt."""
 
 
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
@@ -136,7 +134,7 @@ def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarra
         return np.array([level.get(antennas, mean) for antennas in units])
     both = np.concatenate([spectra.vectors, -spectra.vectors])
     # Units of the same vector, which only spectra without shares have, cannot be told apart: they have one level.
-    group = redundant_groups(spectra.vectors, SAME_VECTOR).index
+    group = redundant_groups(spectra.vectors, SAME_LENGTH).index
     place = group[cKDTree(both).query(noise.vectors[known])[1] % len(group)]
     count = np.bincount(place, minlength=len(group))
     total = np.bincount(place, levels[known], len(group))

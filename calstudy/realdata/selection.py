@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic_core import PydanticCustomError
 
+from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.errors import InputError
 from calstudy.base.units import parse_quantity
 
@@ -23,11 +24,15 @@ KEYS = {
     "polarizations": "polarizations=xx,yy",
 }
 """Keys of selections, with an example each."""
+SAME_FREQUENCY = 1.0
+"""Frequencies that differ by at most this, Hz, are the same but for rounding."""
 
 
 @dataclass(frozen=True)
 class Selection:
     """Part of a data set; None everywhere means all of it. Ranges include both ends, None is an open end.
+
+    A length or a frequency that is an end but for rounding is inside.
 
     Attributes
     ----------
@@ -99,10 +104,10 @@ def select(data: UVData, selection: Selection) -> UVData:
         chosen["bl_lengths"] = low, high
     if selection.times is not None:
         times = np.unique(data.time_array)
-        chosen["times"] = times[_within(np.arange(times.size), selection.times, "times", "integrations")]
+        chosen["times"] = times[_within(np.arange(times.size), selection.times, 0, "times", "integrations")]
     if selection.frequencies is not None:
         chosen["freq_chans"] = np.flatnonzero(
-            _within(np.ravel(data.freq_array), selection.frequencies, "frequencies", "channels")
+            _within(np.ravel(data.freq_array), selection.frequencies, SAME_FREQUENCY, "frequencies", "channels")
         )
     if selection.polarizations is not None:
         chosen["polarizations"] = [_polarization(data, name) for name in selection.polarizations]
@@ -117,9 +122,15 @@ def select(data: UVData, selection: Selection) -> UVData:
         raise InputError(f"--select: nothing is left of the data ({error})") from None
 
 
-def _within(values: np.ndarray, ends: tuple[Any, Any], key: str, what: str) -> np.ndarray:
+def between(values: np.ndarray, ends: tuple[Any, Any], tolerance: float) -> np.ndarray:
+    """Return which values are not below the first end and not above the second, but for a tolerance; None is open."""
     low, high = ends
-    inside = (values >= (-np.inf if low is None else low)) & (values <= (np.inf if high is None else high))
+    above = values >= (-np.inf if low is None else low - tolerance)
+    return above & (values <= (np.inf if high is None else high + tolerance))
+
+
+def _within(values: np.ndarray, ends: tuple[Any, Any], tolerance: float, key: str, what: str) -> np.ndarray:
+    inside = between(values, ends, tolerance)
     if not inside.any():
         raise InputError(f"--select {key}: no {what} in this range; the data have {values.min():g} to {values.max():g}")
     return inside
@@ -133,7 +144,7 @@ def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: boo
     positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     pairs = zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True)
     lengths = np.array([np.linalg.norm(positions[b] - positions[a]) for a, b in pairs])
-    chosen = _within(lengths, ends, "lengths", "baselines (m)")
+    chosen = _within(lengths, ends, SAME_LENGTH, "lengths", "baselines (m)")
     if autos:
         left = np.union1d(data.ant_1_array[chosen], data.ant_2_array[chosen])
         chosen |= (data.ant_1_array == data.ant_2_array) & np.isin(data.ant_1_array, left)

@@ -205,6 +205,15 @@ def test_baselines_out_of_range_have_no_influence_and_are_calibrated(name):
     assert scale == pytest.approx(1, abs=1e-3)
 
 
+def test_baselines_of_the_length_of_an_end_have_weight():
+    """28 m of a hexagon are 27.9999.. or 28.00..01 m."""
+    lengths, antennas = np.array([14, 28 - 1e-9, 28, 28 + 1e-9, 42]), np.array([[0, 1]] * 5)
+    for ends in ({"shortest": "14 m", "longest": "28 m"}, {"shortest": "28 m", "longest": "42 m"}):
+        factors = BaselineRange(**ends).factors(lengths, antennas)
+        assert factors[1] == factors[2] == factors[3] == 1
+        assert factors.sum() == 4
+
+
 @pytest.mark.parametrize("name", ["sky-based", "skycal"])
 def test_antennas_without_any_weight_in_a_taper_are_flagged(name):
     """Their gains would stay where they start: nothing that they change is seen in the loss."""

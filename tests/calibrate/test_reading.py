@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from observations import small_instrument
 from pyuvdata import UVData
 from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_pairs, flag_cube, require_rectangular, to_cube
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, require_rectangular, to_cube
 from calstudy.calibrate.sky_model import match_sky_model
+from calstudy.instrument.telescope import make_template
 from calstudy.realdata.reading import prepare, read_visibilities
 from calstudy.realdata.selection import Selection, parse_values, select, split_selections
 
@@ -126,6 +128,26 @@ def test_selections_are_read_and_applied(data):
     assert (part.Nants_data, part.Ntimes, part.Npols) == (3, 2, 1)
     assert part.freq_array.min() >= 165e6
     assert part.freq_array.max() <= 170e6
+
+
+@pytest.mark.parametrize(
+    ("text", "length"),
+    [("lengths=14 m..50 m", 14), ("lengths=10 m..14 m", 14), ("lengths=28 m..28 m", 28), ("lengths=..42 m", 42)],
+)
+def test_all_baselines_of_the_length_of_an_end_are_selected(text, length):
+    """Lengths are differences of positions in space, which are rounded."""
+    data = make_template(small_instrument(layout={"kind": "hex", "side": 3, "spacing": "14 m"}, times={"count": 1}))
+    lengths = np.linalg.norm(baseline_vectors(data), axis=1)
+    found = np.linalg.norm(baseline_vectors(select(data, selected([text]))), axis=1)
+    alike = [np.sum(np.abs(array - length) < 0.01) for array in (found, lengths)]
+    assert alike[0] == alike[1] > 2
+    assert found.size < lengths.size
+
+
+def test_channels_at_the_ends_are_selected(data):
+    frequencies = np.ravel(data.freq_array)
+    low, high = frequencies[5] + 1e-6, frequencies[9] - 1e-6
+    assert select(data, Selection(frequencies=(low, high))).Nfreqs == 5
 
 
 @pytest.mark.parametrize(
