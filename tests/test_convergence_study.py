@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tiny import tiny
 
+from calstudy.base.errors import InputError
 from calstudy.experiment.files import override, validate
 from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
@@ -63,3 +64,28 @@ def test_expected_and_measured_loss_are_drawn_from_the_same_bins(figures):
     assert (expected[known] > 0).all()
     assert (expected[known] < 1).all()
     assert lengths[:, 0].max() < 0.1 < lengths[:, -1].min()
+
+
+def expecting(folder, **calibration) -> ExperimentStudy:
+    """A study that draws the expected loss only."""
+    data = override({**tiny(folder), "variants": VARIANTS}, "outputs.figures", ["expected-loss"])
+    for name, value in calibration.items():
+        data = override(data, f"calibration.{name}", value)
+    return ExperimentStudy(validate(data, folder))
+
+
+def test_gains_of_two_integrations_together_are_expected_to_take_half(figures, tmp_path, shared_store):
+    """Far from the foregrounds they take their share of the degrees of freedom, of which there are twice as many."""
+    (tmp_path / "store").symlink_to(shared_store)
+    run = run_study(expecting(tmp_path, integrations_per_solve=2), Budget(workers=1))
+    taken = []
+    for folder in (figures, run.folder / "figures"):
+        with np.load(folder / "expected-loss.npz") as arrays:
+            taken.append(1 - arrays["expected.by_length"][0, -3:].mean())
+    assert taken[1] == pytest.approx(taken[0] / 2, rel=0.2)
+
+
+def test_a_loss_of_smoothed_gains_is_not_expected(tmp_path):
+    study = expecting(tmp_path, smooth_gains={"kind": "polynomial", "frequency_degree": 2})
+    with pytest.raises(InputError, match=r"'expected-loss': needs a fit without calibration\.smooth_gains"):
+        _ = study.figures

@@ -58,7 +58,12 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 
 @memoize
 def expected_loss(graph: Graph) -> Task:
-    """Return the task that predicts T for the middle integration."""
+    """Return the task that predicts T for the middle integration; raises InputError if gains are smoothed."""
+    if graph.experiment.calibration.smooth_gains is not None:
+        raise InputError(
+            "figure 'expected-loss': needs a fit without calibration.smooth_gains, for the expected loss is that of "
+            "the gains as fitted; leave out one of the two"
+        )
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
     return ExpectedLoss(LABEL, probes=PROBES, power=power, **solved_inputs(graph))
 
@@ -109,9 +114,9 @@ def solved_inputs(graph: Graph, parity: str = "even") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class _Solution:
-    """The problem of one integration and its solution: gains (Nants, Nfreqs), model (Nbls, Nfreqs), pairs (Nbls, 2).
+    """The problem of one solve and its solution: gains (Nants, Nfreqs), model (Ntimes Nbls, Nfreqs), pairs (Nbls, 2).
 
-    `vectors` are those of the baselines, m, (Nbls, 3).
+    `vectors` are those of the baselines, m, (Nbls, 3). A solve has one integration, or several together.
     """
 
     problem: CalibrationProblem
@@ -123,10 +128,10 @@ class _Solution:
 
     @property
     def lengths(self) -> np.ndarray:
-        """Lengths of the baselines, m, (Nbls,)."""
+        """Lengths of the baselines of each integration, m, (Ntimes Nbls,)."""
         import numpy as np
 
-        return np.linalg.norm(self.vectors, axis=1)
+        return np.resize(np.linalg.norm(self.vectors, axis=1), len(self.model))
 
     def axes(self, modes: DelayModes) -> dict[str, Any]:
         """Return the inputs of `modes_of` beside amplitudes: delays, lengths and the centre of the band."""
@@ -134,7 +139,7 @@ class _Solution:
 
 
 class Solved(Calibrated):
-    """A calibrated integration of simulated data."""
+    """A calibrated integration of simulated data, with those that were solved together with it."""
 
     calibration: Input
     calibrator: GainFit = called("calibration")
@@ -142,29 +147,30 @@ class Solved(Calibrated):
     integration: int
 
     def solution(self) -> _Solution | None:
-        """Return the solution, or None if an antenna or a channel has no gains or the integration was not solved."""
+        """Return the solution, or None if an antenna or a channel has no gains or the integrations were not solved."""
         from calstudy.calibrate.preparation import problem_at
         from calstudy.products.selection import read_gains
 
-        data, sky, noise = self.read(self.times)
+        records = [
+            found
+            for found in map(Solve.from_json, read_json(self.calibration / SOLUTION)["records"])
+            if found.integration <= self.integration < found.integration + found.n_integrations
+        ]
+        first, count = records[0].integration, records[0].n_integrations
+        times = integration_times(self.data / DATA)[first : first + count]
+        data, sky, noise = self.read(times)
+        record = next(found for found in records if found.polarization == data.polarization_array[0])
         prepared = prepared_fit(self.calibrator, data, sky, noise)
         fitted = read_gains(self.calibration)
         gains = fitted.at(self.integration, prepared.data.numbers)
-        records = map(Solve.from_json, read_json(self.calibration / SOLUTION)["records"])
-        record = next(
-            found
-            for found in records
-            if found.polarization == data.polarization_array[0]
-            and found.integration <= self.integration < found.integration + found.n_integrations
-        )
-        problem = problem_at(prepared, self.calibrator, slice(0, 1), 0, gains, record)
+        problem = problem_at(prepared, self.calibrator, slice(0, count), 0, gains, record)
         if isinstance(problem, str) or fitted.flags[self.integration].any():
             return None
-        model = read_visibilities(self.calibration / MODEL, self.times)
+        model = read_visibilities(self.calibration / MODEL, times)
         return _Solution(
             problem,
             gains,
-            to_cube(model)[0, ..., 0],
+            to_cube(model)[..., 0].reshape(problem.visibilities.shape),
             antenna_pairs(model),
             prepared.data.vectors,
             np.asarray(data.freq_array, float),
@@ -176,8 +182,8 @@ class Solved(Calibrated):
         return integration_times(self.data / DATA)[[self.integration]]
 
 
-class ExpectedLoss(Solved, stage="expected-loss", version=4):
-    """The expected T of one calibrated integration."""
+class ExpectedLoss(Solved, stage="expected-loss", version=5):
+    """The expected T of one calibrated integration; since version 5 that of all that were solved together."""
 
     probes: int
 
@@ -233,7 +239,8 @@ class Response(Solved, stage="response", version=1):
 def cost_of_responses(task: Solved, responses: int, memory: float) -> Cost:
     """Return the cost of some linear responses, with the bytes of memory for the paper's array."""
     size = size_of(task)
-    work = size.baselines * size.channels.count / PAPER_SAMPLES
+    samples = size.baselines * size.channels.count * task.calibrator.integrations_per_solve
+    work = samples / PAPER_SAMPLES
     return Cost(6 + 0.8 * responses * work, LIBRARIES_MEMORY + memory * work, 1e6)
 
 

@@ -189,6 +189,11 @@ class DataCalibration(DataStudy):
         if content.expected_loss and not isinstance(content.calibration, GainFit):
             label = content.calibration.label
             raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
+        if content.expected_loss and content.calibration.smooth_gains is not None:
+            raise InputError(
+                "expected_loss: is that of the gains as fitted, and calibration.smooth_gains changes them; leave out "
+                "one of the two"
+            )
         facts = read_selected(content, content.observed.data, even=False)
         if {"hyperdrive", "mwaocal"} & set(content.also) and set(facts.polarizations) != LINEAR:
             raise InputError(

@@ -379,3 +379,10 @@ def test_an_antenna_that_cannot_be_calibrated_is_flagged_with_its_number(command
     assert not found.residual.data_array[dead].any()
     command(data, *options, "--output", "plain", "--no-gain-errors")
     assert not CalibratedData(tmp_path / "plain").gains.flag_array.all(axis=(1, 2, 3)).any()
+
+
+def test_the_loss_of_smoothed_gains_is_not_expected(command, data):
+    smooth = ["--set", "smooth_gains.kind=polynomial", "--set", "smooth_gains.frequency_degree=2"]
+    code, told = command(data, *OPTIONS, *smooth, "--expected-loss", "--dry-run")
+    assert code == 2
+    assert "--expected-loss: is that of the gains as fitted, and calibration.smooth_gains changes them" in told
