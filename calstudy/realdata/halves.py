@@ -6,6 +6,7 @@ The halves, even and odd, see the same sky with independent noise.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,8 @@ class Facts:
 
     `frame` has antennas, baselines (autocorrelations among them) and channels, ascending. `times` (Julian dates) and
     `sidereal_times` (rad) are (Ntimes,); `integration` is the duration of the shortest one, s. `autos` is true if there
-    are autocorrelations of all antennas. `polarizations` are those of parallel hands, as pyuvdata numbers them.
+    are autocorrelations of all antennas. `polarizations` are those of parallel hands, as pyuvdata numbers them; where
+    power spectra are made x is the eastern feed, whatever the file calls it.
     """
 
     unit: str
@@ -123,7 +125,7 @@ class Parts:
         # Reading metadata does not need the averaging of data, which takes long to import.
         from calstudy.power.average import divide
 
-        even, odd = (self.facts[parity] for parity in PARITIES)
+        even = self.facts["even"]
         count = power.n_blocks(even.duration, even.integration)
         if count == 1:
             return {"centre": self.centre}
@@ -131,11 +133,6 @@ class Parts:
             raise InputError(
                 f"power.coherent_time = {power.coherent_time:g} s: a block must hold two integrations, "
                 f"{2 * even.integration:g} s, of which each half has one"
-            )
-        if abs(odd.duration - even.duration) > even.integration:
-            raise InputError(
-                f"power.coherent_time: observed.odd lasts {odd.duration:g} s and observed.data "
-                f"{even.duration:g} s; only data of the same duration have blocks of the same sky"
             )
         span = [float(even.times.min()), float(even.times.max())] if self.interleaved else None
         found = [
@@ -175,7 +172,12 @@ def read_facts(
     times, rows = np.unique(data.time_array, return_index=True)
     places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     numbers = np.unique(pairs)
-    parallel = [int(number) for number in data.polarization_array if number in PARALLEL_HANDS]
+    data.polarization_array = np.array([number for number in data.polarization_array if number in PARALLEL_HANDS])
+    if even and data.telescope.feed_array is not None:
+        # What has no such feeds is refused once it is prepared.
+        with suppress(InputError):
+            east_and_north(data)
+    parallel = data.polarization_array.tolist()
     return Facts(
         unit=str(data.vis_units),
         frame=Frame(
@@ -227,8 +229,11 @@ def _require_even(frequencies: np.ndarray) -> None:
         )
 
 
-def require_same_sky(even: Facts, odd: Facts) -> None:
-    """Raise InputError unless two data sets can be crossed: the same channels and sidereal times."""
+def require_same_sky(even: Facts, odd: Facts, sky_model: Path | None = None) -> None:
+    """Raise InputError unless two data sets can be crossed: the same channels, sidereal times and samples of the sky.
+
+    Baselines are the cross-correlations that are calibrated: those of the sky model, if there is one.
+    """
     if even.frequencies.shape != odd.frequencies.shape or not np.allclose(
         even.frequencies, odd.frequencies, rtol=0, atol=0.01 * even.channels.width
     ):
@@ -240,6 +245,38 @@ def require_same_sky(even: Facts, odd: Facts) -> None:
             f"observed.odd: its mean sidereal time is {apart:.4g} s from that of observed.data, and at most one "
             f"integration ({even.integration:.4g} s) is allowed: it must see the same sky"
         )
+    if abs(odd.duration - even.duration) > even.integration:
+        raise InputError(
+            f"observed.odd: lasts {odd.duration:g} s and observed.data {even.duration:g} s; select integrations of the "
+            "same duration, which see the same sky"
+        )
+    if odd.polarizations != even.polarizations:
+        names = [", ".join(PARALLEL_HANDS[number] for number in facts.polarizations) for facts in (odd, even)]
+        raise InputError(
+            f"observed.odd: has the polarizations {names[0]} and observed.data {names[1]}; give both the same in the "
+            "same order, for example by observed.select.polarizations"
+        )
+    _require_same_baselines(
+        *(facts.frame if sky_model is None else modelled(facts.frame, sky_model) for facts in (even, odd))
+    )
+
+
+def _require_same_baselines(even: Frame, odd: Frame) -> None:
+    found = [{(a, b) for a, b in frame.pairs[~frame.autos].tolist()} for frame in (even, odd)]
+    if found[0] == found[1]:
+        return
+    either_way = [{(min(pair), max(pair)) for pair in pairs} for pairs in found]
+    if lacking := sorted(either_way[0] ^ either_way[1]):
+        raise InputError(
+            f"observed.odd: {len(lacking)} baselines, such as that of antennas {lacking[0][0]} and {lacking[0][1]}, "
+            "are in only one of observed.data and observed.odd; select the antennas that both have by "
+            "observed.select.antennas"
+        )
+    a, b = min(found[1] - found[0])
+    raise InputError(
+        f"observed.odd: has the baseline ({a}, {b}), and observed.data ({b}, {a}); turn the baselines of one of them, "
+        "for example by conjugate_bls of pyuvdata"
+    )
 
 
 def interleaved(data: UVData, parity: str) -> UVData:

@@ -178,7 +178,6 @@ def test_halves_of_measured_data_have_the_blocks_that_both_have():
     ("times", "coherent_time", "odd", "told"),
     [
         (np.arange(7), 15.0, None, "must hold two integrations, 20 s"),
-        (np.arange(60), 100.0, np.arange(30), r"observed\.odd lasts 300 s and observed\.data 600 s"),
         ([0, 20], 30.0, None, "gaps leave no block"),
     ],
 )

@@ -147,6 +147,54 @@ def test_a_plan_asks_the_calibrator(tmp_path, calibrator, layout, modelled, sent
     assert sentence in str(caught.value)
 
 
+def turned(data: UVData) -> UVData:
+    data.conjugate_bls("ant2<ant1")
+    return data
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda data: data.select(antenna_nums=data.telescope.antenna_numbers[:-1], inplace=False), "in only one of"),
+        (lambda data: data.select(polarizations=["xx"], inplace=False), "polarizations xx and observed.data xx, yy"),
+        (turned, r"has the baseline \(1, 0\), and observed.data \(0, 1\); turn"),
+        (
+            lambda data: data.select(times=np.unique(data.time_array)[1:3], inplace=False),
+            "lasts 20 s and observed.data 40",
+        ),
+    ],
+)
+def test_odd_data_of_other_samples_are_refused_by_a_plan(tmp_path, change, told):
+    data = measurement(polarizations=("xx", "yy"))
+    data.write_uvh5(tmp_path / "even.uvh5")
+    change(data).write_uvh5(tmp_path / "odd.uvh5")
+    with pytest.raises(InputError, match=rf"observed\.odd: .*{told}"):
+        study(tmp_path, {"data": "even.uvh5", "odd": "odd.uvh5"})
+
+
+def test_odd_data_with_samples_that_are_not_used_are_taken(tmp_path):
+    """Other antennas that are not selected, and feeds of other names."""
+    data = measurement()
+    data.select(antenna_nums=data.telescope.antenna_numbers[1:], inplace=False).write_uvh5(tmp_path / "even.uvh5")
+    data.polarization_array = np.array([-6])
+    data.telescope.set_feeds_from_x_orientation("north", feeds=["x", "y"], polarization_array=np.array([-5, -6]))
+    data.write_uvh5(tmp_path / "odd.uvh5")
+    section = {"data": "even.uvh5", "odd": "odd.uvh5", "select": {"antennas": "1,2,3,4"}}
+    parts = study(tmp_path, section).data
+    assert parts.facts["even"].polarizations == parts.facts["odd"].polarizations == (-5,)
+
+
+def test_antenna_numbers_of_odd_data_are_checked(tmp_path):
+    data = measurement()
+    data.write_uvh5(tmp_path / "even.uvh5")
+    data.telescope.antenna_numbers = data.telescope.antenna_numbers + 900
+    data.ant_1_array, data.ant_2_array = data.ant_1_array + 900, data.ant_2_array + 900
+    data.baseline_array = data.antnums_to_baseline(data.ant_1_array, data.ant_2_array)
+    data.write_uvh5(tmp_path / "odd.uvh5")
+    with pytest.raises(InputError, match="antenna number 906 is too large for the estimator"):
+        study(tmp_path, {"data": "even.uvh5", "odd": "odd.uvh5"})
+
+
 def test_gains_of_an_export_are_not_those_of_measured_data(tmp_path):
     measurement().write_uvh5(tmp_path / "data.uvh5")
     with pytest.raises(ExperimentError, match=r"calibration.folder: is for simulated data; .* as calibration.gains"):

@@ -99,9 +99,10 @@ def _halves(file: ObservedFile) -> Parts:
     section = file.observed
     even = read_selected(file, section.data)
     odd = read_selected(file, section.odd) if section.odd else even
-    require_antennas(file.power, even.frame.numbers, "leave them out by observed.select.antennas")
+    for facts in (even, odd):
+        require_antennas(file.power, facts.frame.numbers, "leave them out by observed.select.antennas")
     if section.odd:
-        require_same_sky(even, odd)
+        require_same_sky(even, odd, section.sky_model)
     elif even.times.size < 2:
         raise InputError(
             f"observed.data: {even.times.size} integration; two are needed, for even and odd, or other data of the "
