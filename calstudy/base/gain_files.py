@@ -279,8 +279,9 @@ def read_hyperdrive(path: Path) -> GainTable:
     if frequencies is not None and not (np.isfinite(frequencies).all() and (frequencies > 0).all()):
         frequencies = None
     times = None
-    if start is not None and end is not None and start.all() and end.all():
-        times = _julian_dates(np.stack([start, end], axis=1))
+    if start is not None and end is not None:
+        known = np.stack([start, end], axis=1)
+        times = _julian_dates(known) if np.isfinite(known).all() and known.all() else None
     return GainTable(
         _of_jones(values[..., ::2] + 1j * values[..., 1::2]),
         None if names is None else [str(name).strip() for name in names],

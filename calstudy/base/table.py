@@ -112,8 +112,11 @@ def number(value: float, uncertainty: float | None = None) -> str:
     """Write a number with three digits, or with its uncertainty and the digits that are significant for it."""
     if not uncertainty:
         return f"{value:.3g}"
-    places = min(15, max(0, 1 - math.floor(math.log10(uncertainty))))
-    size = f"{value:.3g}" if abs(value) >= LARGE else f"{value:.{places}f}"
+    if not math.isfinite(uncertainty):
+        return f"{value:.3g} (error not known)"
+    large = LARGE <= abs(value) < math.inf
+    places = 1 - math.floor(math.log10(uncertainty)) + (math.floor(math.log10(abs(value))) if large else 0)
+    size = f"{value:.{min(15, max(0, places))}{'e' if large else 'f'}}"
     plain = uncertainty >= 100 and abs(value) < LARGE
     return f"{size} ± {uncertainty:.0f}" if plain else f"{size} ± {uncertainty:.2g}"
 

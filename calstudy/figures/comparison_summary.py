@@ -241,7 +241,7 @@ def _draw_points(
 class ComparisonTolerances(CasesFigure):
     """Bias and T against the severity of each fault: of worlds with labels such as ``positions: 2 cm``."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     kind: str = "comparison-tolerances"
     caption = (

@@ -107,8 +107,11 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=6):
-    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
+class Comparison(Task, stage="comparison", version=7):
+    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
+
+    Severities such as ``.5 cm``, and signs after a text, are read as they are written since version 7.
+    """
 
     title: str
     calibrators: Sequence[str]

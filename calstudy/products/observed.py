@@ -211,7 +211,8 @@ class Observe(Task, stage="observe", version=3):
         if isinstance(scale, Factor):
             return scale.unit
         autos = np.equal(*antenna_pairs(data).T)
-        measured = np.where(flag_cube(data), np.nan, to_cube(data).real)[:, autos]
+        power = to_cube(data).real
+        measured = np.where(flag_cube(data) | (power <= 0), np.nan, power)[:, autos]
         frequencies = np.asarray(data.freq_array, float)
         beam = make_beam(self.beam, self.size["channels"])
         ratios = []
@@ -220,7 +221,7 @@ class Observe(Task, stage="observe", version=3):
             expected = scale.autocorrelations(frequencies, effective_area(frequencies, omega_p))
             ratios.append(expected / measured[..., index])
         found = np.nanmedian(ratios) if np.isfinite(ratios).any() else np.nan
-        if not found > 0:
+        if not 0 < found < np.inf:
             raise InputError("observed.flux_scale: the data have no autocorrelations that are unflagged and positive")
         return float(found)
 

@@ -198,8 +198,8 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         return Cost(10 + engine.seconds, max(memory, LIBRARIES_MEMORY), disk)
 
 
-class SetLevel(Task, stage="observed-level", version=1):
-    """The factor of the EoR."""
+class SetLevel(Task, stage="observed-level", version=2):
+    """The factor of the EoR, from cross-correlations; since version 2 also where autocorrelations are calibrated."""
 
     level: float | None
     eor: Input
@@ -210,7 +210,7 @@ class SetLevel(Task, stage="observed-level", version=1):
         found = 1.0
         sky = read_visibilities(self.eor / VISIBILITIES).data_array
         if self.level is not None:
-            model = read_visibilities(self.calibration / MODEL)
+            model = crosses_of(read_visibilities(self.calibration / MODEL))
             values = model.data_array[~model.flag_array]
             if not values.size or not np.any(values):
                 raise InputError(

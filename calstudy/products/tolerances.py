@@ -22,7 +22,8 @@ BAND = (0.2, 0.5)
 """Band of k, h/Mpc, in which the bias is measured."""
 COUNTS = 1.0
 """A band of k counts if the upper limit of the bias is below this part of the EoR."""
-_NUMBER = re.compile(r"(?:^[-+])?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+# A hyphen within a word is no sign, and a full stop within one no decimal point.
+_NUMBER = re.compile(r"(?:(?<!\S)[-+])?(?:\d+\.?\d*|(?<![^\s+-])\.\d+)(?:[eE][-+]?\d+)?")
 
 
 def upper_limit(bias: float, error: float) -> float:

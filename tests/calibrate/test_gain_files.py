@@ -195,6 +195,15 @@ def test_files_of_hyperdrive_need_only_the_solutions(world, tmp_path):
     assert np.allclose(cal.gain_array[rows], gains[:, :, :1], rtol=1e-12)
 
 
+@pytest.mark.parametrize("unknown", [0.0, np.nan])
+def test_times_that_hyperdrive_does_not_know_are_none(world, tmp_path, unknown):
+    """Of one solution, which holds at all times."""
+    data, _, gains = world
+    write_fits(tmp_path / "gains.fits", gains[:, :, :1].conj(), data, times=np.array([unknown, unknown]))
+    cal = read_gains(tmp_path / "gains.fits", "test", data)
+    assert np.allclose(cal.gain_array, gains[:, :, :1], rtol=1e-12)
+
+
 def test_names_of_antennas_decide_over_their_order(world, tmp_path):
     data, _, gains = world
     order = np.random.default_rng(2).permutation(N_ANTENNAS)

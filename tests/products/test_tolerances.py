@@ -27,6 +27,23 @@ def test_levels_are_no_severities_and_hyphens_no_signs():
     assert found.severities == (0.0, 50.0)
 
 
+@pytest.mark.parametrize(
+    ("severity", "told"),
+    [
+        (".5 cm", [(0.5, "cm")]),
+        ("up to .5e-1 cm", [(0.05, "cm")]),
+        ("+5 cm", [(5.0, "cm")]),
+        ("no.5 cm", [(5.0, "cm")]),
+        ("2. cm", [(2.0, "cm")]),
+        ("level -40 dB", []),
+        ("level -.5 dB", []),
+        ("level +40 dB", [(40.0, "dB")]),
+    ],
+)
+def test_severities_are_read_as_they_are_written(severity, told):
+    assert [(fault.severities[-1], fault.unit) for fault in faults(["ideal", f"rfi: {severity}"])] == told
+
+
 def test_an_error_that_is_not_known_tells_nothing():
     assert tolerance(SEVERITIES, np.array([0, 3, 5, 9]), np.full(4, np.nan)).relation == "?"
 

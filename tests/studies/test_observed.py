@@ -23,8 +23,9 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import ExpectedBins, TransferFunction
-from calstudy.products.files import DATA
+from calstudy.products.files import DATA, MODEL, VISIBILITIES
 from calstudy.products.observed import observed as observed_task
+from calstudy.products.observed_injection import SetLevel
 from calstudy.products.selection import read_gains
 from calstudy.realdata.halves import PARITIES
 from calstudy.studies.kinds.experiment import ExperimentStudy
@@ -356,6 +357,31 @@ def test_data_become_jansky(simulated, folder):
     omega, _ = beam.solid_angles(frequencies, "xx")
     expected = 1.380649e-23 * 100 * omega * (frequencies / 299792458.0) ** 2 / 1e-26
     assert np.median(expected[:, None] / autos) == pytest.approx(1, rel=1e-12)
+
+
+def test_autocorrelations_of_zero_tell_no_scale(simulated, folder):
+    """As of antennas that are not connected and not flagged."""
+    data = with_autos(simulated, measurement(simulated, "even"))
+    temperature = {"kind": "system-temperature", "receiver": "100 K", "sky": "0 K"}
+    found = []
+    for name, dead in (("alive", 0), ("dead", 30)):
+        data.data_array[data.ant_1_array == data.ant_2_array, :dead] = 0
+        data.write_uvh5(folder / f"{name}.uvh5")
+        scaled = halves(folder, name, {"data": f"{name}.uvh5", "flux_scale": temperature})["even"]
+        found.append(scaled.data_array[scaled.ant_1_array != scaled.ant_2_array])
+    # The median is of fewer channels, between which the beam differs.
+    assert np.abs(found[1]).mean() == pytest.approx(np.abs(found[0]).mean(), rel=0.2)
+
+
+def test_the_level_of_an_injection_is_relative_to_cross_correlations(simulated, tmp_path):
+    model, factors = measurement(simulated, "even"), []
+    for name, fitted in (("crosses", model), ("autos", with_autos(simulated, model))):
+        (tmp_path / name).mkdir()
+        fitted.write_uvh5(tmp_path / name / MODEL)
+        model.write_uvh5(tmp_path / name / VISIBILITIES)
+        task = SetLevel("level", level=-10.0, eor=tmp_path / name, calibration=tmp_path / name)
+        factors.append(task.make(tmp_path / name)["factor"])
+    assert factors == pytest.approx([0.1, 0.1])
 
 
 def test_antennas_get_their_positions(simulated, folder):

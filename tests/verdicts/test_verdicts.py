@@ -193,6 +193,11 @@ def test_what_is_missing_is_said():
         (176.2, 86.7, "176 ± 87"),
         (5809.3, 892.1, "5809 ± 892"),
         (3.5741e6, 8.34e5, "3.57e+06 ± 8.3e+05"),
+        (123456.0, 10.0, "1.23456e+05 ± 10"),
+        (-123456.0, 4e6, "-1e+05 ± 4e+06"),
+        (1.0, float("nan"), "1 (error not known)"),
+        (3.0, float("inf"), "3 (error not known)"),
+        (float("inf"), 1.0, "inf ± 1"),
     ],
 )
 def test_a_number_has_the_digits_that_its_uncertainty_leaves_meaning_to(value, uncertainty, text):
