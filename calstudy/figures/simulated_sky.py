@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
@@ -326,6 +326,9 @@ def _draw_baseline(axes: Axes, baseline: BaselineDelays, buffer: float) -> None:
 
 class SimulatedComponentsFigure(StudyFigure):
     """The simulated components alone: wedge of F, P(k) of S over its input, delay spectra of three baselines."""
+
+    # Baselines of equal lengths share a bin of the wedge since 2.
+    version: ClassVar[int] = 2
 
     kind: str = "simulated-components"
 

@@ -31,7 +31,14 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, bins_of_k, outside_wedge
+from calstudy.power.spectra import (
+    CylindricalSpectrum,
+    DelaySpectra,
+    SphericalSpectrum,
+    bins_of_k,
+    bins_of_length,
+    outside_wedge,
+)
 
 NEGLIGIBLE = 1e-3
 """Correlations of powers below this are taken as zero."""
@@ -216,7 +223,7 @@ def spherical_average(
 
 def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: bool = True) -> CylindricalSpectrum:
     """Average over baselines of similar length with equal weights for all pairs; `folded` averages +-tau as well."""
-    bins, index = np.unique(np.floor(spectra.length / settings.length_bin).astype(int), return_inverse=True)
+    bins, index = np.unique(bins_of_length(spectra.length, settings.length_bin), return_inverse=True)
     power = np.zeros((bins.size, spectra.delay.size), dtype=complex)
     np.add.at(power, index, spectra.n_pairs[:, None] * spectra.power)
     n_pairs = np.zeros(bins.size, dtype=int)

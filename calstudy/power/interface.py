@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Protocol, cast
@@ -18,6 +19,8 @@ from calstudy.power.spectra import DelaySpectra, average_times
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
+
+logger = logging.getLogger(__name__)
 
 
 class PowerBeam(Protocol):
@@ -76,16 +79,16 @@ def estimate_spectra(
     """Return the delay spectra of even times odd by the estimator of the settings, checked.
 
     The data are as for `Estimator.estimate`, but of one integration or several, whose powers are averaged.
-    Polarizations and integrations that are completely flagged in either are left out, and so are baselines that are
-    completely flagged in another integration.
+    Polarizations that are completely flagged in either are left out, then integrations in which one of the others is,
+    and baselines that are completely flagged in another integration.
     The estimator may write files into `folder`, or nowhere if it is None; with several integrations each has its own
     folder, `block-1` and so on.
 
     Raises
     ------
     InputError
-        If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, or if even and odd
-        data have different numbers of integrations.
+        If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, if even and odd
+        data have different numbers of integrations, or if no integration or no baseline is left.
     """
     estimator = cast(Estimator, settings.estimator)
     found = []
@@ -129,14 +132,25 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
             "must have the same"
         )
     every = [(_integration(even, number), _integration(odd, number)) for number in range(even.Ntimes)]
-    pairs = [pair for pair in every if not any(uvd.flag_array.all() for uvd in pair)] or every[:1]
+    with_data = [pair for pair in every if not any(uvd.flag_array.all() for uvd in pair)]
+    pairs = [pair for pair in with_data if not any(uvd.flag_array.all(axis=(0, 1)).any() for uvd in pair)]
+    if with_data and not pairs:
+        raise InputError(
+            f"power.coherent_time: every block lacks one of the polarizations {', '.join(even.get_pols())}, flagged "
+            "altogether; a longer time may help, or a selection of one polarization"
+        )
+    if len(pairs) < len(with_data):
+        lacking = len(with_data) - len(pairs)
+        logger.warning("%d of %d blocks are left out: one polarization is flagged", lacking, len(every))
+    pairs = pairs or every[:1]
     missing = np.any([uvd.flag_array.all(axis=1) for pair in pairs for uvd in pair], axis=0)
     for pair in pairs:
         for uvd in pair:
             uvd.flag_array |= missing[:, None]
-    if missing.all() and len(pairs) > 1:
+    if missing.any(axis=1).all() and len(pairs) > 1:
         raise InputError(
-            "power.coherent_time: every baseline is flagged altogether in one of the blocks; a longer time may help"
+            "power.coherent_time: every baseline is flagged altogether in one of the blocks, in one of the "
+            f"polarizations {', '.join(even.get_pols())}; a longer time may help"
         )
     return pairs
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import positions
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
@@ -210,16 +211,31 @@ def bins_of_k(modes: DelaySpectra | BaselineModes, edges: np.ndarray) -> np.ndar
     return bins
 
 
+def bins_of_length(lengths: np.ndarray, width: float) -> np.ndarray:
+    """Return the bin of each baseline length, int, from zero; both lengths and the width of the bins are in m.
+
+    A length that is the edge of two bins but for rounding is in the upper one, so that equal lengths share a bin.
+    """
+    return np.floor((lengths + SAME_LENGTH) / width).astype(int)
+
+
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:
     """Return the spectra of the units that all have in common, each averaged over the same pairs of baselines.
 
     Baselines that are completely flagged have no spectra. Those of an antenna without gains are missing in the spectra
     of the residual, but not in those of the EoR. The spectra, by name, have the same delays and their units in the same
-    order. Raise InputError if they have no unit in common, and ValueError if the order differs.
+    order. Raise InputError if they have no unit in common or units that cannot be told apart, and ValueError if the
+    order differs.
     """
     first, *others = keys = [one.pairs_of_units() for one in spectra.values()]
     if all(other == first for other in others):
         return dict(spectra)
+    if any(len(set(found)) < len(found) for found in keys):
+        raise InputError(
+            f"the spectra of {', '.join(spectra)} are not of the same baselines, and which they have in common cannot "
+            "be told: baselines of the same vector need the shares of their antennas (share_unit, share_antenna, "
+            "share_pairs and share_power), which the estimator does not give"
+        )
     places = {name: {key: unit for unit, key in enumerate(found)} for name, found in zip(spectra, keys, strict=True)}
     common = set.intersection(*(set(found) for found in places.values()))
     if not common:

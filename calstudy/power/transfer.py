@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, outside_wedge
+from calstudy.power.spectra import BaselineModes, bins_of_k, bins_of_length, outside_wedge
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -304,7 +304,7 @@ def _squared_coherence(signal: Sums, response: Sums, cross: Sums) -> tuple[np.nd
 def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap:
     """Return T in bins of baseline length, `length_bin` m wide, and delay."""
     signal = injection.signal
-    lengths, row = np.unique(np.floor(signal.length / length_bin).astype(int), return_inverse=True)
+    lengths, row = np.unique(bins_of_length(signal.length, length_bin), return_inverse=True)
     spacing = signal.delay[1] - signal.delay[0]
     step = np.rint(signal.delay / spacing).astype(int)
     column = np.abs(step)
@@ -430,7 +430,7 @@ def bin_expected(
     total = np.bincount(bins[used], transfer[used], limits.size - 1)
     square = np.bincount(bins[used], error[used] ** 2, limits.size - 1)
     filled = np.where(count > 0, count, np.nan)
-    rows, row = np.unique(np.floor(modes.length / length_bin).astype(int), return_inverse=True)
+    rows, row = np.unique(bins_of_length(modes.length, length_bin), return_inverse=True)
     spacing = modes.delay[1] - modes.delay[0]
     column = np.abs(np.rint(modes.delay / spacing).astype(int))
     cell = (row[:, None] * (column.max() + 1) + column)[known]

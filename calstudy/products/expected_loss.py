@@ -183,7 +183,10 @@ class Solved(Calibrated):
 
 
 class ExpectedLoss(Solved, stage="expected-loss", version=5):
-    """The expected T of one calibrated integration; since version 5 that of all that were solved together."""
+    """The expected T of one calibrated integration; since version 5 that of all that were solved together.
+
+    Baselines of equal lengths share a bin since then.
+    """
 
     probes: int
 

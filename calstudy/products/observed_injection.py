@@ -276,8 +276,8 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
         return _cost_of_average(self)
 
 
-class ObservedTransfer(Injected, stage="observed-transfer", version=4, cost=Cost(4, disk=1e6)):
-    """T of measured data."""
+class ObservedTransfer(Injected, stage="observed-transfer", version=5, cost=Cost(4, disk=1e6)):
+    """T of measured data; baselines of equal lengths share a bin since version 5."""
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T, spectra of the injected EoR, and the power of the residual corrected by T."""
@@ -354,8 +354,8 @@ class _OfData(Task):
         return Cost(20, LIBRARIES_MEMORY + 1.5e9 + 10 * size_of(self).samples * COMPLEX128, 1e6)
 
 
-class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=2):
-    """The expected T of the middle solve of one half of measured data."""
+class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=3):
+    """The expected T of the middle solve of one half of measured data; equal lengths share a bin since version 3."""
 
     power: PowerSettings
 

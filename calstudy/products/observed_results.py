@@ -87,7 +87,7 @@ class ObservedTable(StudyTable):
 class ObservedSpectra(Task, stage="observed-spectra", version=2, cost=Cost(10, disk=5e6)):
     """Wedge and spherical spectra; errors are those of the noise, from the difference of halves on each baseline.
 
-    Baselines of the same vector have their own noise since version 2, and are in one bin of length.
+    Baselines of the same vector have their own noise, and equal lengths share a bin, since version 2.
     """
 
     power: PowerSettings

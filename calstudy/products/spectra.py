@@ -182,11 +182,12 @@ def read_delay_spectra(folder: Path) -> DelaySpectra:
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
 
-class Spectra(Task, stage="spectra", version=3, cost=Cost(2, disk=5e6)):
+class Spectra(Task, stage="spectra", version=4, cost=Cost(2, disk=5e6)):
     """Wedge and spherical spectra of all variants, with errors.
 
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
-    (paper section Reduction of Simulation Products); each enters the variants that contain its component.
+    (paper section Reduction of Simulation Products); each enters the variants that contain its component. Equal lengths
+    share a bin of the wedge since version 4.
     """
 
     power: PowerSettings

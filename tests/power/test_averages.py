@@ -9,6 +9,7 @@ from hera_pspec import grouping
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors
 from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
@@ -17,8 +18,15 @@ from calstudy.power import cosmology as c
 from calstudy.power.binned import cylindrical_average, make_bin_edges, modes_in_bins, spherical_average
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, delay_spectra, outside_wedge
+from calstudy.power.spectra import (
+    CylindricalSpectrum,
+    DelaySpectra,
+    delay_spectra,
+    of_common_units,
+    outside_wedge,
+)
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
+from calstudy.power.transfer import Injection, bin_expected, cylindrical_transfer
 from calstudy.products.observed import WHAT
 from calstudy.products.observed_results import ObservedSpectra
 from calstudy.products.spectra import DELAY_SPECTRA
@@ -401,6 +409,38 @@ def test_noise_from_two_sources_is_compared_on_the_baselines_of_both(tmp_path, o
     # Powers of the same white data, outside the wedge and everywhere.
     assert ratio is None or ratio["mean"] == pytest.approx(1, abs=0.2)
     assert all(told in row[-1] and bool(told) == bool(row[-1]) for row in table.rows)
+
+
+def test_equal_lengths_share_a_bin_of_the_wedge(observe, white, beam):
+    """Lengths of 14, 28, 42 and 56 m of a hexagon are edges of bins, and differ by rounding."""
+    settings = PowerSettings(pairs="same-baseline", length_bin="14 m")
+    template = observe(HexLayout(kind="hex", side=3), n_channels=16)
+    data = white(template, np.random.default_rng(3))
+    spectra = delay_spectra(estimate_power(data, data, beam, settings), settings)
+    assert len(np.unique(spectra.length)) > len(np.unique(spectra.length.round(6)))
+    counts = np.bincount(np.floor(spectra.length.round(6) / 14 + 1e-9).astype(int))[1:]
+    wedge = cylindrical_average(spectra, settings)
+    np.testing.assert_array_equal(wedge.n_pairs, counts)
+    injection = Injection(spectra, spectra, spectra)
+    np.testing.assert_allclose(cylindrical_transfer(injection, 14.0).bin_edges, wedge.bin_edges)
+    ones = np.ones(spectra.power.shape)
+    expected = bin_expected(spectra, ones, 0 * ones, [0.0, 1.0], 0.0, 14.0)
+    np.testing.assert_allclose(expected.length_edges, wedge.bin_edges)
+
+
+def test_redundant_baselines_without_shares_are_not_matched(observe, white, beam):
+    settings, template = PowerSettings(pairs="same-baseline"), observe(HexLayout(kind="hex", side=2), n_channels=16)
+    data = white(template, np.random.default_rng(3))
+    whole = delay_spectra(estimate_power(data, data, beam, settings), settings)
+    part = whole.of_units(np.arange(2, 12))
+    assert of_common_units({"eor": whole, "residual": part})["eor"].power.tolist() == part.power.tolist()
+    empty = {name: np.zeros(0, int) for name in ("share_unit", "share_antenna", "share_pairs")}
+    whole, part = (dataclasses.replace(one, **empty) for one in (whole, part))
+    assert of_common_units({"eor": whole, "residual": whole})["eor"] is whole
+    with pytest.raises(
+        InputError, match=r"of eor, residual are not of the same baselines.*\(share_unit, share_antenna"
+    ):
+        of_common_units({"eor": whole, "residual": part})
 
 
 def test_tables_come_back(tmp_path):

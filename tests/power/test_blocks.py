@@ -137,6 +137,26 @@ def test_flagged_blocks_and_baselines_are_left_out(observe, white, beam, rng):
         estimate_spectra(even, odd.select(blt_inds=np.arange(3 * n), inplace=False), beam, SETTINGS)
 
 
+def test_blocks_without_one_of_the_polarizations_are_left_out(observe, white, beam, rng):
+    template = observe(GolombLayout(kind="golomb", count=4), n_times=3, integration=600.0, polarizations=("xx", "yy"))
+    even, odd = white(template, rng), white(template, rng)
+    n = even.Nbls
+    even.flag_array[n : 2 * n, :, 1] = True
+    assert estimate_spectra(even, odd, beam, SETTINGS).n_times == 2
+    odd.flag_array[2 * n :, :, 0] = even.flag_array[:n, :, 0] = True
+    with pytest.raises(InputError, match=r"power\.coherent_time: every block lacks one of the polarizations ee, nn"):
+        estimate_spectra(even, odd, beam, SETTINGS)
+
+
+def test_baselines_that_lack_a_polarization_in_turn_are_refused(observe, white, beam, rng):
+    template = observe(GolombLayout(kind="golomb", count=3), n_times=3, integration=600.0, polarizations=("xx", "yy"))
+    even = white(template, rng)
+    for block in range(3):
+        even.flag_array[block * even.Nbls + block, :, 1] = True
+    with pytest.raises(InputError, match="every baseline is flagged altogether in one of the blocks, in one of the"):
+        estimate_spectra(even, white(template, rng), beam, SETTINGS)
+
+
 def test_spectra_that_were_stored_before_there_were_blocks_are_of_one(observe, white, beam, rng, tmp_path):
     import h5py
 
