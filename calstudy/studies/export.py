@@ -170,7 +170,11 @@ def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
 
 SEEDS = ("seed", "seeds", "seeds_without_eor")
 DRAWN = ("sky.foregrounds", "sky.eor", "sky.diffuse", "corruption.noise")
-"""Blocks that always get new seeds; of others, those that differ from their defaults."""
+EFFECTS, AS_BUILT = "corruption.effects", "instrument.as_built"
+"""Blocks that always get new seeds, and so does all below effects and, if antennas differ, below the array as built.
+
+Of others, those get new seeds that differ from their defaults.
+"""
 BITS = 128
 
 
@@ -182,7 +186,7 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
     """
     experiments = {case.world: case.experiment for case in worlds.cases}
     drawn = {
-        world: {**worlds.resolved["worlds"].get(world, {}), **_drawn(experiment)}
+        world: _replaced(worlds.resolved["worlds"].get(world, {}), _drawn(experiment))
         for world, experiment in experiments.items()
     }
     recipe = {**worlds.resolved, "worlds": drawn, "salt": secrets.token_hex(BITS // 8)}
@@ -198,14 +202,21 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
     return sha256(path)
 
 
+def _replaced(changes: Mapping[str, Any], drawn: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes of a world with new seeds, which come last: a seed that is set otherwise would come back."""
+    return {**{path: value for path, value in changes.items() if path not in drawn}, **drawn}
+
+
 def _drawn(experiment: Experiment) -> dict[str, Any]:
     """Return new seeds of all random draws of an experiment, by dotted path."""
     full = experiment.model_dump(mode="json", include={"instrument", "sky", "corruption"})
     other = experiment.model_dump(mode="json", include=set(full), exclude_defaults=True)
     changed = {block for block, _ in _walk(other, "")}
+    # Effects may all be the default, whose seed is public.
+    drawn = (EFFECTS, AS_BUILT) if experiment.instrument.as_built.note else (EFFECTS,)
     found: dict[str, Any] = {}
     for block, content in _walk(full, ""):
-        if block in DRAWN or block in changed:
+        if block in DRAWN or block in changed or f"{block}.".startswith(tuple(f"{above}." for above in drawn)):
             for name in SEEDS:
                 if name in content:
                     two = [secrets.randbits(BITS) for _ in range(2)]

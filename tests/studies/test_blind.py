@@ -9,7 +9,7 @@ import yaml
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, salted
-from calstudy.products.corruption import PARITIES, data
+from calstudy.products.corruption import PARITIES, data, truths
 from calstudy.products.graph import Graph
 from calstudy.studies.export import BITS, CARRIER, write_recipe
 from calstudy.studies.kinds.comparison import WorldData, load_worlds
@@ -130,3 +130,33 @@ def test_gains_come_back_by_the_salted_digests(blind_worlds, recipe, tmp_path):
 def test_a_recipe_is_not_replaced(open_worlds, recipe):
     with pytest.raises(InputError, match="is there already"):
         write_recipe(open_worlds, recipe)
+
+
+def test_no_effect_of_a_recipe_is_that_of_the_public_file_also_if_it_is_the_default(tmp_path):
+    """Default effects, and the defaults in which an array as built does not differ, have public seeds."""
+    file = tmp_path / "plain.yaml"
+    built = {"positions": {"scatter": "2 cm"}}
+    file.write_text(yaml.safe_dump({"name": "plain", "instrument": {"layout": "hera-19", "as_built": built}}))
+    write_recipe(load_worlds(file, None, (), CARRIER), tmp_path / "recipe.yaml")
+
+    def drawn(path):
+        [case] = load_worlds(path, None, (), CARRIER).cases
+        keys = {task.key for task in truths(Graph(case.experiment))}
+        content = case.experiment.model_dump(mode="json")
+        return keys, set(seeds_in(content["corruption"])) | set(seeds_in(content["instrument"]["as_built"]))
+
+    open_keys, open_seeds = drawn(file)
+    secret_keys, secret_seeds = drawn(tmp_path / "recipe.yaml")
+    assert len(open_keys) == len(secret_keys) > 0
+    assert not open_keys & secret_keys
+    assert not open_seeds & secret_seeds
+
+
+def test_a_seed_that_the_file_sets_before_it_sets_the_effects_does_not_come_back(tmp_path):
+    file = tmp_path / "plain.yaml"
+    file.write_text(yaml.safe_dump({"name": "plain", "instrument": {"layout": "hera-19"}}))
+    effects = "corruption.effects=[{kind: per-channel-gains, seed: 77}]"
+    worlds = load_worlds(file, None, ["corruption.effects.0.seed=76", effects], CARRIER)
+    write_recipe(worlds, tmp_path / "recipe.yaml")
+    [case] = load_worlds(tmp_path / "recipe.yaml", None, (), CARRIER).cases
+    assert case.experiment.corruption.effects[0].seed > 2 ** (BITS // 2)
