@@ -319,7 +319,7 @@ def make(
     lease = Lease(store)
     is_complete = len(found_of(targets, store)) == len({task.key for task in targets})
     is_complete = is_complete and not without_record(targets, store)
-    if not is_complete and not strict:
+    if not is_complete:
         store.prepare()
     # A complete store is only read, unless a file turns out to be damaged; no other run removes its product.
     with nullcontext() if is_complete and not strict else lease.holding(task.key for task in unique(targets)):

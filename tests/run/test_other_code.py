@@ -80,6 +80,11 @@ def test_a_strict_run_makes_them_again_and_nothing_else(store, capsys, monkeypat
     assert run(store, capsys, strict=True)[0] == set()
 
 
+def test_a_strict_run_makes_a_store_that_is_not_there(store, capsys):
+    assert not store.root.exists()
+    assert run(store, capsys, strict=True)[0] == {"data", "result", "other"}
+
+
 def test_what_a_dropped_product_was_made_with_is_not_forgotten(store, capsys, monkeypatch):
     run(store, capsys)
     store.discard("first", DATA.key)
