@@ -91,6 +91,16 @@ def read_run(folder: Path) -> Reference:
     return Reference(run.arrays(), run.claims)
 
 
+def require_same_study(reference: Path, run: Path) -> None:
+    """Raise InputError if a run is of another study than a reference, which it would replace."""
+    name, other = RunFolder(reference).content.get("name"), RunFolder(run).name
+    if name != other:
+        raise InputError(
+            f"--update: {run} is a run of {other!r}, and {reference} is the reference of {name!r}; give the reference "
+            "of the same study, or a folder that does not exist, for a new one"
+        )
+
+
 def accept(run: Path, reference: Path) -> None:
     """Make a finished run the reference: its pictures, arrays, tables, claims and description replace the old ones.
 
@@ -274,8 +284,8 @@ def compare_array(
         problem = "" if equal else "different"
         status: Status = "same" if equal else "moved" if anything else "beyond"
         return ArrayComparison(figure, name, status, None, None, None, None, "equal", rule.why, problem)
-    if not np.array_equal(np.isfinite(old), np.isfinite(made)):
-        return _without_numbers(figure, name, "moved" if anything else "beyond", "finite in other places")
+    if not _same_where_not_finite(old, made):
+        return _without_numbers(figure, name, "moved" if anything else "beyond", "finite in other places, or not alike")
     relative = _relative(old, made)
     deviations = _deviations(rule, reference, name, made) if isinstance(rule, Drawn) else None
     if relative <= ROUNDING and (deviations is None or deviations[0] <= ROUNDING):
@@ -286,6 +296,12 @@ def compare_array(
         status = "moved"
     largest, rms, shift = deviations or (None, None, None)
     return ArrayComparison(figure, name, status, relative, largest, rms, shift, str(rule), rule.why)
+
+
+def _same_where_not_finite(old: np.ndarray, made: np.ndarray) -> bool:
+    """Return whether both arrays are not finite in the same places, and have the same infinities and NaN there."""
+    places = ~np.isfinite(old)
+    return np.array_equal(places, ~np.isfinite(made)) and np.array_equal(old[places], made[places], equal_nan=True)
 
 
 def _too_far(rule: Drawn, deviations: tuple[float, float, float]) -> bool:

@@ -47,22 +47,27 @@ def regress(
     folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
-    from calstudy.regression import accept, find_references, remake, show, write_json
+    from calstudy.regression import accept, find_references, remake, require_same_study, show, write_json
     from calstudy.run.execution import Budget
 
     console = Console(soft_wrap=True, highlight=False)
     if against is not None:
-        if not folders or len(folders) != 1:
-            raise InputError("--against RUN: give the one reference folder that the run is to be compared with")
-        if update and not folders[0].exists():
+        if overrides or any(option is not None for option in (workers, max_memory, scheduler)):
+            raise InputError("--against RUN: nothing is made again; leave out --set, --workers and the like")
+        if update and folders and len(folders) == 1 and not folders[0].exists():
             accept(against, folders[0])
             console.print(f"{folders[0]}: new reference", markup=False)
             return
     if update and not folders and not Path("figures").is_dir():
         raise InputError("--update: there is no folder 'figures' here; give the references that are to be updated")
+    references = find_references(folders or ([] if against else [reference_folder()]))
+    if against is not None and len(references) != 1:
+        raise InputError("--against RUN: give the one reference folder that the run is to be compared with")
     made, holds = {}, True
-    for reference in find_references(folders or [reference_folder()]):
+    for reference in references:
         run = against or remake(reference, overrides or (), Budget(workers, max_memory, scheduler), console)
+        if update:
+            require_same_study(reference, run)
         regression = _compare(reference, run)
         show(regression, console)
         write_json(regression, run)

@@ -178,7 +178,14 @@ def test_what_is_missing_new_or_of_another_shape_is_told():
     assert found["new"][0] == "moved"
     assert found["c"] == ("beyond", "different")
     nan = compare_array("layout", "enu", {"enu": np.array([1.0, np.nan])}, np.array([np.nan, 1.0]))
-    assert (nan.status, nan.problem) == ("beyond", "finite in other places")
+    assert (nan.status, nan.problem) == ("beyond", "finite in other places, or not alike")
+
+
+@pytest.mark.parametrize("made", [[1, np.nan, np.inf], [1, np.inf, np.inf], [1, -np.inf, np.nan]])
+def test_infinities_and_missing_numbers_are_not_the_same(made):
+    reference = {"enu": np.array([1, np.inf, np.nan])}
+    assert compare_array("layout", "enu", reference, reference["enu"].copy()).status == "same"
+    assert compare_array("layout", "enu", reference, np.array(made, dtype=float)).status == "beyond"
 
 
 def test_times_of_a_machine_are_told_and_never_too_far():
@@ -244,6 +251,28 @@ def test_the_command_answers_with_its_exit_status_and_overwrites_only_if_told(tm
     updated = command.invoke(app, ["regress", str(kept), "--against", str(finished), "--update"])
     assert updated.exit_code == 0
     assert command.invoke(app, ["regress", str(kept), "--against", str(finished)]).exit_code == 0
+
+
+def test_a_run_never_replaces_the_references_of_other_studies(tmp_path, finished):
+    command, other, kept = CliRunner(), tmp_path / "all" / "other", tmp_path / "all" / "tiny"
+    for folder in (other, kept):
+        accept(finished, folder)
+    (other / "experiment.yaml").write_text((other / "experiment.yaml").read_text().replace("name: tiny", "name: other"))
+    before = {path: path.read_bytes() for path in (tmp_path / "all").rglob("*") if path.is_file()}
+    for folder, told in {tmp_path / "all": "give the one reference folder", other: "a run of 'tiny', and"}.items():
+        refused = command.invoke(app, ["regress", str(folder), "--against", str(finished), "--update"])
+        assert isinstance(refused.exception, InputError)
+        assert told in str(refused.exception)
+    assert {path: path.read_bytes() for path in (tmp_path / "all").rglob("*") if path.is_file()} == before
+    # Another study may be compared.
+    assert command.invoke(app, ["regress", str(other), "--against", str(finished)]).exit_code == 0
+
+
+@pytest.mark.parametrize("option", [["--set", "sky.eor.seed=3"], ["--workers", "2"], ["--max-memory", "4 GB"]])
+def test_options_of_a_run_are_refused_where_none_is_made(reference, finished, option):
+    refused = CliRunner().invoke(app, ["regress", str(reference), "--against", str(finished), *option])
+    assert isinstance(refused.exception, InputError)
+    assert "nothing is made again" in str(refused.exception)
 
 
 def test_folders_that_hold_nothing_are_told(tmp_path, reference):
