@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
@@ -185,7 +185,7 @@ def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: C
     study = load_study(reference / EXPERIMENT, None, overrides)
     if not study.has_reference:
         raise InputError(f"{reference}: is a {study.key}, which has no reference results")
-    return run_study(study, budget, console, strict=True).folder
+    return run_study(study, replace(budget, strict=True), console).folder
 
 
 Status = Literal["same", "moved", "beyond"]

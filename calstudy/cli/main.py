@@ -111,8 +111,9 @@ def run(
     changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
     study = load_study(file, scale, changes)
     if finished:
+        _require_not_strict(strict)
         study = study.with_finished(finished, console)
-    show_run(run_study(study, Budget(workers, max_memory, scheduler), console, strict), console)
+    show_run(run_study(study, Budget(workers, max_memory, scheduler, strict), console), console)
 
 
 @app.command()
@@ -133,13 +134,19 @@ def plan(
 
     study = load_study(file, scale, overrides or ())
     if finished:
+        _require_not_strict(strict)
         # With JSON, nothing else is on standard output.
         study = study.with_finished(finished, Console(soft_wrap=True, highlight=False, stderr=as_json), planned=True)
-    found = describe_plan(study, Budget(workers, max_memory), strict)
+    found = describe_plan(study, Budget(workers, max_memory, strict=strict))
     if as_json:
         typer.echo(json.dumps(found, indent=1))
     else:
         show_plan(found, Console(highlight=False))
+
+
+def _require_not_strict(strict: bool) -> None:
+    if strict:
+        raise InputError("--strict: makes all products of other code again, and --finished takes some; leave one out")
 
 
 @app.command()

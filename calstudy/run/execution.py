@@ -234,11 +234,13 @@ class Budget:
     workers : number of worker processes, or None for one per core within the memory
     max_memory : memory of all workers together, such as "6 GB", or None for all free memory
     scheduler : address of a running dask scheduler, whose memory is not checked, or None
+    strict : if true, products of other code or other versions of packages are made again, which need memory as well
     """
 
     workers: int | None = None
     max_memory: str | None = None
     scheduler: str | None = None
+    strict: bool = False
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ from calstudy.experiment.model import Experiment, Folders
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.simulation import SimulateChunk
-from calstudy.run.execution import Budget
+from calstudy.run.execution import Budget, found_of
+from calstudy.run.provenance import of_other_code
 from calstudy.run.store import Store
-from calstudy.run.task import Task
+from calstudy.run.task import Task, unique
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""
@@ -59,7 +60,7 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
         return file, workers or 1
     memory = _memory(budget)
     hoped = workers or cores()
-    lean = _stream(_cut(_Work(file, targets), memory / hoped), memory / hoped)
+    lean = _stream(_cut(_Work(file, targets, budget.strict), memory / hoped), memory / hoped)
     return lean.file, _workers(lean.missing, memory, hoped, budget)
 
 
@@ -119,14 +120,15 @@ def _require_room(largest: Task, need: float, budget: float, source: str) -> Non
 
 @dataclass(frozen=True)
 class _Work(Generic[File]):
-    """A file, and the tasks that a run would have to make for it."""
+    """A file, and the tasks that a run would have to make for it; a `strict` one makes those of other code again."""
 
     file: File
     targets: Callable[[File], Sequence[Task]]
+    strict: bool
 
     @cached_property
     def missing(self) -> Sequence[Task]:
-        return _missing(self.targets(self.file), self.file.outputs.store)
+        return _missing(self.targets(self.file), self.file.outputs.store, self.strict)
 
     def largest(self, kind: type[Task]) -> float:
         """Return the memory of the largest missing product of a kind; zero if none is missing."""
@@ -162,12 +164,14 @@ def _stream(work: _Work[File], share: float) -> _Work[File]:
     return work
 
 
-def _missing(targets: Sequence[Task], folder: Path) -> Sequence[Task]:
-    """Return the tasks whose products are missing in the store, from a quick look."""
+def _missing(targets: Sequence[Task], folder: Path, strict: bool) -> Sequence[Task]:
+    """Return the tasks whose products are missing in the store or, with `strict`, of other code, from a quick look."""
     store, found = Store(folder), {}
+    tasks = unique(targets) if strict else []
+    other = of_other_code(tasks, found_of(tasks, store))
 
     def visit(task: Task) -> None:
-        if task.key not in found and store.find(task.stage.name, task.key) is None:
+        if task.key not in found and (task.key in other or store.find(task.stage.name, task.key) is None):
             found[task.key] = task
             for needed in task.needs.values():
                 visit(needed)

@@ -39,14 +39,14 @@ def _gigabytes(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e7 else f"{count / 1e6:.1f} MB"
 
 
-def describe_plan(study: Study, budget: Budget, strict: bool = False) -> dict[str, Any]:
+def describe_plan(study: Study, budget: Budget) -> dict[str, Any]:
     """Return the products and the cost of a run as plain JSON types; seconds on one core, and bytes.
 
     Raises InputError if the study does not fit, or store or run folders cannot be written.
     """
     study, workers = study.sized_to(budget)
     store = Store(study.outputs.store)
-    plan = schedule(study.targets, store, study.external_keys, strict)
+    plan = schedule(study.targets, store, study.external_keys, budget.strict)
     if plan.todo:
         require_writable(store.root, f"outputs.store = {str(store.root)!r}")
     require_writable(study.folder.parent, f"outputs.runs = {str(study.folder.parent)!r}")

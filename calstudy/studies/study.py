@@ -365,7 +365,7 @@ def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) ->
     return [] if sentence is None else [sentence]
 
 
-def run_study(study: Study, budget: Budget | None = None, console: Console | None = None, strict: bool = False) -> Run:
+def run_study(study: Study, budget: Budget | None = None, console: Console | None = None) -> Run:
     """Make all products of a study that are missing in the store, and fill its run folder.
 
     Parameters
@@ -373,11 +373,9 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
     study
         From `calstudy.studies.load.load_study`.
     budget
-        Workers and memory.
+        Workers and memory, and whether products of other code are made again.
     console
         Console for the progress; None for no output.
-    strict
-        If true, products of other code or other versions of packages are made again.
 
     Raises
     ------
@@ -392,7 +390,8 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
         for part in study.with_parts():
             open_folder(part.folder, part.subfolders)
             logs.enter_context(log_to(part.folder / LOG))
-        made = make(study.targets, store, Workers(count, study.folder / LOG, budget.scheduler), console, strict)
+        workers = Workers(count, study.folder / LOG, budget.scheduler)
+        made = make(study.targets, store, workers, console, budget.strict)
         return _filled(study, made)
 
 

@@ -13,6 +13,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.products import corruption, simulation
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.graph import Graph
+from calstudy.run.store import Store
 from calstudy.run.task import Task
 from calstudy.studies import capacity
 from calstudy.studies.kinds.experiment import ExperimentStudy
@@ -25,7 +26,7 @@ def targets_of(experiment: Experiment) -> list[Task]:
     return ExperimentStudy(experiment).targets
 
 
-def fit(experiment: Experiment, *budget: int | str | None, targets: Callable = targets_of):
+def fit(experiment: Experiment, *budget: int | str | bool | None, targets: Callable = targets_of):
     return capacity.fit(experiment, Budget(*budget), targets)
 
 
@@ -86,6 +87,22 @@ def test_smaller_pieces_are_the_same_products(paper):
     assert before.key == after.key
     assert not {task.key for task in before.pieces.values()} & {task.key for task in after.pieces.values()}
     assert ExperimentStudy(paper).folder == ExperimentStudy(little).folder
+
+
+def test_a_strict_run_has_room_for_what_is_of_other_code(paper):
+    """Such a product is in the store, and is made again."""
+
+    def targets(experiment):
+        return [eor_of(experiment)]
+
+    empty = fit(paper, 8, "8 GB", targets=targets)
+    assert empty[0].simulation.chunks > paper.simulation.chunks
+    task, store = eor_of(paper), Store(paper.outputs.store)
+    store.prepare()
+    with store.building(task.stage.name, task.key) as folder:
+        store.seal(folder, {"stage": task.stage.name, "key": task.key, "lineage": "of other code"})
+    assert fit(paper, 8, "8 GB", targets=targets) == (paper, 8)
+    assert fit(paper, 8, "8 GB", None, True, targets=targets) == empty
 
 
 def test_what_cannot_fit_is_refused_in_one_sentence(paper):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from command_line import run_command
 from rich.console import Console
 from tiny import of_the_paper
 
@@ -212,6 +213,15 @@ def elsewhere(folder: Path, place: Path, *overrides: str) -> Collection:
     """Return the same collection with an empty store, and a folder of runs, in another place."""
     changes = [f"outputs.store={place / 'store'}", f"outputs.runs={place / 'runs'}", *overrides]
     return load_study(write(folder), overrides=changes)
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+def test_finished_members_are_not_made_again_by_a_strict_run(tmp_path, capsys, command):
+    (tmp_path / "study.yaml").write_text("{name: both, experiments: [a.yaml]}")
+    (tmp_path / "a.yaml").write_text("name: a")
+    status, told = run_command(capsys, command, tmp_path / "study.yaml", "--strict", "--finished", tmp_path)
+    assert (status, told.count("\n")) == (2, 1)
+    assert "--strict: makes all products of other code again, and --finished takes some" in told
 
 
 def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished, folder, tmp_path):
