@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.package_files import find_experiment
 from calstudy.base.paths import value_at, with_value
+from calstudy.base.plugins import FILE_REFERENCE
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, AssumedFile, assumed_changes, assumed_world
 from calstudy.experiment.messages import sentences
@@ -323,6 +325,39 @@ def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) ->
     overrides : ``path=value`` texts, applied after the scale
     """
     return StudyFile.open(path, scale, overrides).experiment()
+
+
+def with_absolute_paths(content: Any, read: Iterable[BaseModel], folder: Path) -> Any:
+    """Return the content of a file with absolute paths of plug-ins and input files, which start at a folder.
+
+    What was `read` from the content says which of its texts are paths.
+    """
+    used = {text for item in read for text in _texts(item.model_dump(mode="json")) if text.startswith("/")}
+
+    def absolute(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: absolute(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [absolute(item) for item in value]
+        if isinstance(value, str):
+            file = FILE_REFERENCE.fullmatch(value)
+            path = value if file is None else file["path"]
+            # A text that is no path may have no home folder, or characters that no path has.
+            with suppress(RuntimeError, ValueError, OSError):
+                found = f"{(folder / Path(path).expanduser()).resolve()}{value.removeprefix(path)}"
+                return found if found in used else value
+        return value
+
+    return absolute(content)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield all texts in nested blocks and lists."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(item)
 
 
 def dump(content: BaseModel) -> str:

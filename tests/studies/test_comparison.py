@@ -287,3 +287,104 @@ def test_a_world_that_changes_nothing_is_refused(tmp_path):
     path = comparison_file(tmp_path, worlds={"ideal": {}, "as it is": {"instrument.channels.count": count}})
     with pytest.raises(ExperimentError, match="worlds: 'as it is' is the same as 'ideal'; change a field"):
         load_study(path)
+
+
+OWN_CALIBRATOR = """
+from calstudy.calibrate.interface import Calibrator
+
+class Mine(Calibrator):
+    def calibrate(self, observation, assumed, progress=None):
+        raise NotImplementedError
+"""
+POSITIONS = "number,east_m,north_m,up_m\n" + "".join(f"{n},{14 * n},{n * n},0\n" for n in range(7))
+
+
+def read_back(study, folder):
+    """Return the comparison of the file in a run folder, which is written elsewhere."""
+    folder.mkdir()
+    (folder / "experiment.yaml").write_text(study.texts["experiment.yaml"])
+    return load_study(folder / "experiment.yaml")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "power.taper=hann",
+        "corruption={noise: {factor: 3}}",
+        "sky.eor.seed=64",
+        "sky.foregrounds={count: 50}",
+        "calibration.solver.max_steps=7",
+        "calibration.assumed.sky.foregrounds.count=9",
+        "corruption.noise={kind: times-foregrounds, factor: 0.1}",
+    ],
+)
+def test_the_file_in_the_run_folder_has_the_changes_of_the_command_line(tmp_path, change):
+    overrides = {"calibration.chunks": 1, "calibration.assumed": {"sky.foregrounds.errors": {"flux_scatter": 0.1}}}
+    worlds = {
+        "ideal": {},
+        "coarse": {"sky.eor": {"nside": 32}},
+        "few": {"sky.foregrounds.count": 40, "instrument.as_built.positions.scatter": "1 cm"},
+    }
+    names = {"CALAMITY": {"calibrator": "calamity", "chunks": 2}, "groups": {"calibrator": "calamity-redundant"}}
+    study = load_study(comparison_file(tmp_path, overrides=overrides, calibrators=names, worlds=worlds), None, [change])
+    again = read_back(study, tmp_path / "run")
+    assert again.folder.name == study.folder.name
+    assert [case.experiment.calibration for case in again.cases] == [case.experiment.calibration for case in study.cases]
+
+
+def test_the_file_in_the_run_folder_names_files_by_their_full_paths_and_has_the_salt(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN_CALIBRATOR)
+    (tmp_path / "positions.csv").write_text(POSITIONS)
+    worlds = {"ideal": {}, "placed": {"instrument.layout": {"kind": "csv", "path": "positions.csv"}}}
+    for world in worlds.values():
+        world["instrument.location"] = "mwa"
+    names = {"mine": "mine.py", "class": {"calibrator": "mine.py:Mine"}}
+    study = load_study(comparison_file(tmp_path, calibrators=names, worlds=worlds, salt="5a17"))
+    again = read_back(study, tmp_path / "run")
+    assert again.folder.name == study.folder.name
+    assert again.file.salt == "5a17"
+
+
+def test_relative_paths_start_at_the_file_that_names_them(tmp_path):
+    base, own = tmp_path / "base", tmp_path / "own"
+    for folder in (base, own):
+        folder.mkdir()
+        (folder / "positions.csv").write_text(POSITIONS)
+    (own / "mine.py").write_text(OWN_CALIBRATOR)
+    placed = {"kind": "csv", "path": "positions.csv"}
+    path = comparison_file(own, experiment="../base/base.yaml", calibrators={"mine": "mine.py"})
+    data = yaml.safe_load((own / "base.yaml").read_text())
+    data["instrument"] |= {"layout": placed, "location": "mwa"}
+    (base / "base.yaml").write_text(yaml.safe_dump(data))
+
+    def places(**fields):
+        comparison_file(own, experiment="../base/base.yaml", calibrators={"mine": "mine.py"}, **fields)
+        return {case.world: case.experiment.instrument.layout.path.parent for case in load_study(path).cases}
+
+    assert places(worlds={"ideal": {}}) == {"ideal": base}
+    worlds = {"ideal": {}, "moved": {"instrument.layout": placed, "sky.eor.seed": 3}}
+    assert places(worlds=worlds) == {"ideal": base, "moved": own}
+    assert places(worlds={"ideal": {}}, overrides={"instrument.layout": placed}) == {"ideal": own}
+    assert load_study(path).cases[0].experiment.calibration.calibrator == str(own / "mine.py")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("calibration=redcal", "changes the calibrator, which each entry of calibrators names"),
+        ("calibration.calibrator=redcal", "changes the calibrator, which each entry of calibrators names"),
+        ("realizations={count: 5}", "changes realizations, which has no effect"),
+        ("sweep={sky.eor.seed: [1, 2]}", "changes sweep, which has no effect"),
+        ("outputs.figures=[wedge]", "changes outputs.figures, which has no effect"),
+        ("outputs={figures: [wedge]}", "changes outputs.figures, which has no effect"),
+        ("papers=[calamity2022]", "changes papers, which has no effect"),
+    ],
+)
+def test_what_no_case_could_have_is_refused(tmp_path, change, told):
+    with pytest.raises(InputError, match=f"^--set {change.partition('=')[0]}: {told}"):
+        load_study(comparison_file(tmp_path), None, [change])
+    field, _, value = change.partition("=")
+    changes = {field: yaml.safe_load(value)}
+    with pytest.raises(ExperimentError, match=f"^overrides: '{field}' {told}"):
+        load_study(comparison_file(tmp_path, overrides=changes))
+    load_study(comparison_file(tmp_path), None, ["outputs.figures=[]", "papers=[]"])

@@ -30,6 +30,7 @@ from calstudy.experiment.files import (
     parse_override,
     read_mapping,
     validate,
+    with_absolute_paths,
 )
 from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment, Figures, StudyName
 from calstudy.figures import StudyFigure, figures_for
@@ -48,8 +49,11 @@ from calstudy.studies.study import KINDS, kind_of
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it, but for `calibration.assumed`."""
+CALIBRATOR = f"calibration.{CALIBRATORS.tag}"
 OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
 """Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
+WITHOUT_EFFECT = ("papers", "outputs.figures", "outputs.tables", *NOT_SHARED[1:])
+"""Fields of an experiment that make nothing in a comparison, whose cases have scores alone."""
 VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
 )
@@ -60,6 +64,17 @@ def _block(block: Any) -> Any:
 
 
 Block = Annotated[dict[str, Any], BeforeValidator(_block, json_schema_input_type=str | dict[str, Any])]
+
+
+def _refusal(path: str, new: Any) -> str | None:
+    """Return why a change of the experiment of all cases, or of those of a world, is refused; None if it is not."""
+    if path in ("calibration", CALIBRATOR):
+        return "changes the calibrator, which each entry of calibrators names"
+    changed = {path: new, **({f"{path}.{name}": item for name, item in new.items()} if isinstance(new, dict) else {})}
+    for field in WITHOUT_EFFECT:
+        if any(value and f"{name}.".startswith(f"{field}.") for name, value in changed.items()):
+            return f"changes {field}, which has no effect: a comparison has scores, and figures of its own"
+    return None
 
 
 class ComparisonFile(Section):
@@ -104,14 +119,24 @@ class ComparisonFile(Section):
                 raise fault("", f"the label {label!r} must have 1 to {LONGEST_LABEL} characters, one a letter or digit")
         return value
 
+    @field_validator("overrides")
+    @classmethod
+    def _have_an_effect(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for path, new in value.items():
+            # Fields of the block `calibration` are those of all calibrators.
+            own = path == "calibration" and isinstance(new, dict) and CALIBRATORS.tag not in new
+            if not own and (refusal := _refusal(path, new)) is not None:
+                raise fault("", f"{path!r} {refusal}")
+        return value
+
     @field_validator("worlds")
     @classmethod
     def _change_no_measurement(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         for label, changes in value.items():
             for path, new in changes.items():
                 block, _, rest = path.partition(".")
-                if path in ("calibration", "calibration.calibrator"):
-                    raise fault("", f"{label!r} changes the calibrator, which each entry of calibrators names")
+                if (refusal := _refusal(path, new)) is not None:
+                    raise fault("", f"{label!r} {refusal}")
                 if block == "power":
                     raise fault("", f"{label!r} changes {path}; all cases are measured alike, use overrides")
                 if not rest and isinstance(new, dict):
@@ -202,22 +227,27 @@ class Comparison(Family):
             data[cls.key] = dict(calibrators)
         content = checked(ComparisonFile, data, file.folder)
         figures = figures_for("comparison", content.figures, "figures")
-        base, origin = _base(content, file, optional=own is not None)
-        worlds = {world: {**fields, **changes} for world, fields in content.worlds.items()}
+        overrides, worlds = _with_changes(content, changes)
+        base = _base(content, file, optional=own is not None)
+        for dotted, value in overrides.items():
+            base = override(base, dotted, value)
         salted = {"salt": content.salt} if content.salt else {}
         blocks = {
             label: {**block, **(salted if block.get(CALIBRATORS.tag) == "by-file" else {})}
             for label, block in content.calibrators.items()
         }
+        members, refusals = _make_cases(blocks, worlds, base, file.folder)
+        # All others are in the experiment.
+        of_calibrators = {path: new for path, new in overrides.items() if path.partition(".")[0] == "calibration"}
+        written = {"overrides": of_calibrators, "worlds": worlds, "calibrators": dict(content.calibrators)}
         resolved = {
             "name": content.name,
             "description": content.description,
-            "experiment": _complete(base, origin),
-            "worlds": worlds,
-            "calibrators": dict(content.calibrators),
+            "experiment": _complete(base, file.folder),
+            **with_absolute_paths(written, members.values(), file.folder),
             "figures": [figure.model_dump(mode="json") for figure in figures],
+            **salted,
         }
-        members, refusals = _make_cases(blocks, worlds, base, origin)
         return cls(content, members, refusals, resolved)
 
     @cached_property
@@ -424,9 +454,38 @@ def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     return {**data, key: {**entries, label: value}}
 
 
+def _with_changes(
+    content: ComparisonFile, changes: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Return the overrides and the worlds of a comparison with changes of --set, which come after both.
+
+    Raises InputError for a change that no case may have.
+    """
+    overrides = dict(content.overrides)
+    worlds = {world: dict(fields) for world, fields in content.worlds.items()}
+    for path, value in changes.items():
+        if (refusal := _refusal(path, value)) is not None:
+            raise InputError(f"--set {path}: {refusal}")
+        # Blocks of calibrators come after overrides, and before worlds.
+        for_all = path.startswith("calibration.")
+        if not for_all:
+            overrides = _with_last(overrides, path, value)
+        for world, fields in worlds.items():
+            kept = {field: own for field, own in fields.items() if not f"{field}.".startswith(f"{path}.")}
+            again = for_all or any(path.startswith(f"{field}.") for field in kept)
+            worlds[world] = _with_last(fields, path, value) if again else kept
+    return overrides, worlds
+
+
+def _with_last(changes: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """Return changes with a last one, and without those of the same field and of fields in it."""
+    kept = {field: own for field, own in changes.items() if not f"{field}.".startswith(f"{path}.")}
+    return {**kept, path: value}
+
+
 def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return an experiment with its defaults and absolute paths, so that it does not depend on its folder."""
-    return _shared(validate(base, folder).model_dump(mode="json"))
+    return _shared(validate(_shared(base), folder).model_dump(mode="json"))
 
 
 def _shared(experiment: Mapping[str, Any]) -> dict[str, Any]:
@@ -449,8 +508,8 @@ def _require_effect(calibration: Any) -> None:
         )
 
 
-def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dict[str, Any], Path]:
-    """Return the experiment from which all cases are made, and the folder of its relative paths.
+def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> dict[str, Any]:
+    """Return the experiment from which all cases are made; relative paths start at the folder of the comparison.
 
     If `optional`, the experiment may lack the scale, because the comparison has it.
     """
@@ -459,15 +518,17 @@ def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> tuple[dic
         base: dict[str, Any] = content.experiment
         _require_effect(base.get("calibration"))
     else:
-        source = folder / content.experiment.expanduser()
-        base, folder = read_mapping(source), source.resolve().parent
+        base, folder = read_mapping(content.experiment), content.experiment.parent
     if (kind := kind_of(base, folder)).model is not Experiment:
         raise ExperimentError([f"experiment: has the key {kind.key or KINDS.tag!r}, and is no single experiment"])
     has_it = scale in (base.get("scales") or {})
     base = _shared(apply_scale(base, scale if has_it or not optional else None))
-    for dotted, value in content.overrides.items():
-        base = override(base, dotted, value)
-    return base, folder
+    if folder == file.folder:
+        return base
+    try:
+        return _shared(validate(base, folder).model_dump(mode="json", exclude_unset=True))
+    except ExperimentError as error:
+        raise ExperimentError([f"experiment ({content.experiment}): {fault}" for fault in error.faults]) from None
 
 
 def _make_cases(
