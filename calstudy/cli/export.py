@@ -37,16 +37,18 @@ def export(
     """
     from calstudy.products.files import quiet_libraries
     from calstudy.run.execution import Budget
-    from calstudy.studies.export import CARRIER, write_recipe
+    from calstudy.studies.export import CARRIER, folders_of, write_recipe
     from calstudy.studies.export import export as write
     from calstudy.studies.kinds.comparison import load_worlds
 
     console = Console(soft_wrap=True, highlight=False)
+    worlds = load_worlds(file, scale, overrides or (), CARRIER)
     if blind is not None:
+        # Nothing is promised of data that cannot be written.
+        folders_of(worlds, output, file_format, overwrite)
         digest = write_recipe(load_worlds(file, scale, overrides or (), None), blind)
         console.print(f"SHA-256 of {blind}, to be published: {digest}", markup=False)
-        file, scale, overrides = blind, None, None
-    worlds = load_worlds(file, scale, overrides or (), CARRIER)
+        worlds = load_worlds(blind, None, (), CARRIER)
     with quiet_libraries():
         folders = write(worlds, output, file_format, overwrite, Budget(workers, max_memory), console)
     for folder in folders:
@@ -88,14 +90,13 @@ def score(
     Prints one row for each world: T and bias free of the flux scale in three bands of k, the flux scale, errors of
     the gains, and χ² of data that were not fitted.
     """
-    from calstudy.base.errors import InputError
     from calstudy.products.files import quiet_libraries
     from calstudy.run.execution import Budget
     from calstudy.studies.kinds.comparison import load_worlds
     from calstudy.studies.scores import measure_scores, tables
 
-    if output is not None and output.exists() and not overwrite:
-        raise InputError(f"--output {output}: is there already; use --overwrite or another name")
+    if output is not None:
+        _require_free(output, overwrite)
     blocks = _blocks(folder, calibrator, name)
     console = Console(soft_wrap=True, highlight=False)
     with quiet_libraries():
@@ -112,6 +113,18 @@ def score(
         console.print(table.markdown(), markup=False)
     for world, calibrator, why in found.refusals:
         console.print(f"{calibrator} cannot work in {world}: {why}", markup=False)
+
+
+def _require_free(output: Path, overwrite: bool) -> None:
+    """Raise InputError if the file of scores cannot be written."""
+    from calstudy.base.errors import InputError
+    from calstudy.run.store import require_writable
+
+    if output.is_dir():
+        raise InputError(f"--output {output}: is a folder; give the name of a file, such as {output / 'scores.json'}")
+    if output.exists() and not overwrite:
+        raise InputError(f"--output {output}: is there already; use --overwrite or another name")
+    require_writable(output.parent, f"--output {output}")
 
 
 def _blocks(folder: Path | None, calibrator: str | None, name: str | None) -> dict[str, Any] | None:

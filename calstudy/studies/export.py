@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from string import Template
@@ -26,10 +26,10 @@ from calstudy.experiment.model import Experiment
 from calstudy.products.corruption import LEVELS
 from calstudy.products.files import DATA, VISIBILITIES, read_json, read_visibilities, write_visibilities
 from calstudy.run.execution import Budget, Workers
-from calstudy.run.store import Product, Store
+from calstudy.run.store import Product, Store, require_writable
 from calstudy.studies.capacity import fit
-from calstudy.studies.folder import log_to, write
-from calstudy.studies.kinds.comparison import Comparison, WorldData
+from calstudy.studies.folder import folder_of_runs, log_to, write
+from calstudy.studies.kinds.comparison import Comparison, WorldData, load_worlds
 from calstudy.studies.study import make
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def export(
 ) -> list[Path]:
     """Write the data of every world, make products that are missing in the store, and return the folders.
 
-    Raises InputError if files would be replaced without `overwrite`, or the data cannot be made or written.
+    Raises InputError as `folders_of` does, or if the data cannot be made.
 
     Parameters
     ----------
@@ -58,17 +58,10 @@ def export(
     folder : that of a single world; several worlds have subfolders ``world-1`` and so on
     file_format : one of `FORMATS`
     """
-    if file_format not in FORMATS:
-        raise InputError(f"--format {file_format}: not a format of visibilities (allowed: {', '.join(FORMATS)})")
-    if file_format == "ms" and find_spec("casacore") is None:
-        raise InputError(f"--format ms: takes {CASACORE}")
-    several = len(worlds.cases) > 1
-    folders = [folder / f"world-{place + 1}" if several else folder for place in range(len(worlds.cases))]
-    _require_free(folders, overwrite)
+    folders = folders_of(worlds, folder, file_format, overwrite)
     fits = [fit(case.experiment, budget, lambda wanted: WorldData.of(wanted).tasks) for case in worlds.cases]
     contents = [WorldData.of(experiment, worlds.file.salt) for experiment, _ in fits]
-    runs = worlds.outputs.runs.expanduser()
-    runs.mkdir(parents=True, exist_ok=True)
+    runs = folder_of_runs(worlds.outputs)
     with log_to(runs / LOG):
         workers = Workers(min(count for _, count in fits), runs / LOG, budget.scheduler)
         targets = [task for content in contents for task in content.tasks]
@@ -79,12 +72,22 @@ def export(
     return folders
 
 
-def _require_free(folders: Sequence[Path], overwrite: bool) -> None:
-    for folder in folders:
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"--output {folder}: is a file, not a folder")
-        if not overwrite and folder.is_dir() and any(folder.iterdir()):
-            raise InputError(f"--output {folder}: holds files already; use --overwrite or another folder")
+def folders_of(worlds: Comparison, folder: Path, file_format: str, overwrite: bool) -> list[Path]:
+    """Return the folder of each world; parameters as for `export`.
+
+    Raises InputError if there is no such format, files would be replaced without `overwrite`, or cannot be written.
+    """
+    if file_format not in FORMATS:
+        raise InputError(f"--format {file_format}: not a format of visibilities (allowed: {', '.join(FORMATS)})")
+    if file_format == "ms" and find_spec("casacore") is None:
+        raise InputError(f"--format ms: takes {CASACORE}")
+    several = len(worlds.cases) > 1
+    folders = [folder / f"world-{place + 1}" if several else folder for place in range(len(worlds.cases))]
+    for place in folders:
+        require_writable(place, f"--output {place}")
+        if not overwrite and place.is_dir() and any(place.iterdir()):
+            raise InputError(f"--output {place}: holds files already; use --overwrite or another folder")
+    return folders
 
 
 def _write_world(content: WorldData, products: Mapping[str, Product], folder: Path, file_format: str) -> None:
@@ -182,7 +185,8 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
     """Write a comparison with secret seeds and a secret salt, for its owner alone; return the SHA-256 of the file.
 
     Data with the EoR and without have separate noise. Only the seeds of the comparison are replaced; `export` and
-    `score` accept the new YAML file in its place. Raises InputError if the file exists already, or cannot be written.
+    `score` accept the new YAML file in its place. Raises InputError, and leaves no file, if it exists already, cannot be
+    written, or cannot be read back.
     """
     experiments = {case.world: case.experiment for case in worlds.cases}
     drawn = {
@@ -199,6 +203,11 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
         ) from None
     except OSError as error:
         raise InputError(f"--blind {path}: cannot be written ({error.strerror})") from None
+    try:
+        load_worlds(path, None, (), None)
+    except InputError as error:
+        path.unlink()
+        raise InputError(f"--blind {path}: the recipe of this file cannot be read back ({error})") from None
     return sha256(path)
 
 

@@ -15,9 +15,10 @@ from typing import Any
 from uuid import uuid4
 
 from calstudy.base.errors import InputError, exit_status
+from calstudy.experiment.model import Folders
 from calstudy.results.reader import EXPERIMENT, MANIFEST
 from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
-from calstudy.run.store import Product
+from calstudy.run.store import Product, require_writable
 from calstudy.run.task import Task, unique
 from calstudy.verdicts.tables import CLAIMS_FILES
 
@@ -43,6 +44,14 @@ def open_folder(folder: Path, subfolders: Sequence[str]) -> None:
         raise InputError(
             f"outputs.runs: {folder} holds {strangers[0]!r}, which no run wrote; move it or choose another folder"
         )
+
+
+def folder_of_runs(outputs: Folders) -> Path:
+    """Return the folder of runs, and make it if it does not exist; raises InputError if it cannot be written."""
+    runs = outputs.runs.expanduser()
+    require_writable(runs, f"outputs.runs = {str(runs)!r}")
+    runs.mkdir(parents=True, exist_ok=True)
+    return runs
 
 
 class _LogFile(logging.FileHandler):

@@ -29,7 +29,7 @@ from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import COUNTS, upper_limit
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store
-from calstudy.studies.folder import log_to
+from calstudy.studies.folder import folder_of_runs, log_to
 from calstudy.studies.kinds.comparison import Comparison, WorldData
 from calstudy.studies.study import make
 from calstudy.verdicts.standing import LARGEST_ERROR, is_measured, standing_table, standings
@@ -140,8 +140,7 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
     for label in {study.name, *(label for case in study.cases for label in (case.world, case.calibrator))}:
         _require_label(label)
     study, count = study.sized_to(budget)
-    runs = study.outputs.runs.expanduser()
-    runs.mkdir(parents=True, exist_ok=True)
+    runs = folder_of_runs(study.outputs)
     cases = [case for case in study.cases if not case.refusal]
     tasks = [required(score_task(Graph(case.experiment, keep_visibilities=False))) for case in cases]
     with log_to(runs / LOG):

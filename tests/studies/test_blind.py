@@ -1,11 +1,14 @@
 """A blind challenge: seeds that nobody can guess, digests that tell nothing, a recipe that scores what comes back."""
 
 import json
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
 import pytest
 import yaml
+from command_line import run_and_read
+from tiny import tiny
 
 from calstudy.base.errors import InputError
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, find_returned, salted
@@ -160,3 +163,56 @@ def test_a_seed_that_the_file_sets_before_it_sets_the_effects_does_not_come_back
     write_recipe(worlds, tmp_path / "recipe.yaml")
     [case] = load_worlds(tmp_path / "recipe.yaml", None, (), CARRIER).cases
     assert case.experiment.corruption.effects[0].seed > 2 ** (BITS // 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--output", "data", "--format", "foo"], "--format foo: not a format"),
+        (["--output", "taken"], "--output taken: cannot be written"),
+    ],
+)
+def test_no_recipe_is_announced_of_data_that_cannot_be_written(tmp_path, monkeypatch, capsys, options, told):
+    monkeypatch.chdir(tmp_path)
+    Path("plain.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    Path("taken").touch()
+    status, written = run_and_read(capsys, "export", "plain.yaml", "--blind", "recipe.yaml", *options)
+    assert status == 2
+    assert told in written.err
+    assert written.err.count("\n") == 1
+    assert (written.out, Path("recipe.yaml").exists()) == ("", False)
+
+
+def test_a_recipe_that_would_not_be_read_again_is_not_left(open_worlds, tmp_path):
+    spoiled = replace(open_worlds, resolved={**open_worlds.resolved, "figures": ["wedge"]})
+    with pytest.raises(InputError, match=r"--blind .*cannot be read back \(figures.0: "):
+        write_recipe(spoiled, tmp_path / "recipe.yaml")
+    assert not (tmp_path / "recipe.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--output", "taken/x.json"], "--output taken/x.json: cannot be written"),
+        (["--output", "folder", "--overwrite"], "--output folder: is a folder; give the name of a file"),
+        (["--set", "outputs.runs=taken"], "outputs.runs = 'taken': cannot be written"),
+    ],
+)
+def test_scores_that_cannot_be_written_are_not_computed(tmp_path, monkeypatch, capsys, options, told):
+    monkeypatch.chdir(tmp_path)
+    Path("plain.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    Path("taken").touch()
+    Path("folder").mkdir()
+    status, written = run_and_read(capsys, "score", "plain.yaml", *options)
+    assert (status, written.err.count("\n")) == (2, 1)
+    assert told in written.err
+    assert not (tmp_path / "store").exists()
+
+
+def test_data_are_not_made_where_the_log_cannot_be_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("plain.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    Path("taken").touch()
+    status, written = run_and_read(capsys, "export", "plain.yaml", "--output", "x", "--set", "outputs.runs=taken")
+    assert (status, written.err.count("\n")) == (2, 1)
+    assert "outputs.runs = 'taken': cannot be written" in written.err
