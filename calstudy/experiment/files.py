@@ -338,7 +338,7 @@ def with_absolute_paths(content: Any, read: Iterable[BaseModel], folder: Path) -
         if isinstance(value, Mapping):
             return {key: absolute(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
-            return [absolute(item) for item in value]
+            return type(value)(map(absolute, value))
         if isinstance(value, str):
             file = FILE_REFERENCE.fullmatch(value)
             path = value if file is None else file["path"]

@@ -185,8 +185,8 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
     """Write a comparison with secret seeds and a secret salt, for its owner alone; return the SHA-256 of the file.
 
     Data with the EoR and without have separate noise. Only the seeds of the comparison are replaced; `export` and
-    `score` accept the new YAML file in its place. Raises InputError, and leaves no file, if it exists already, cannot be
-    written, or cannot be read back.
+    `score` accept the new YAML file in its place. Raises InputError if the file exists already, cannot be written, or
+    cannot be read back.
     """
     experiments = {case.world: case.experiment for case in worlds.cases}
     drawn = {

@@ -329,7 +329,9 @@ def test_the_file_in_the_run_folder_has_the_changes_of_the_command_line(tmp_path
     study = load_study(comparison_file(tmp_path, overrides=overrides, calibrators=names, worlds=worlds), None, [change])
     again = read_back(study, tmp_path / "run")
     assert again.folder.name == study.folder.name
-    assert [case.experiment.calibration for case in again.cases] == [case.experiment.calibration for case in study.cases]
+    assert [case.experiment.calibration for case in again.cases] == [
+        case.experiment.calibration for case in study.cases
+    ]
 
 
 def test_the_file_in_the_run_folder_names_files_by_their_full_paths_and_has_the_salt(tmp_path):

@@ -216,6 +216,12 @@ def faults_of(data: dict, folder) -> list[str]:
         ({"calibration.basis.buffer": "50 ns"}, "sweep.0.calibration.basis.buffer: must be a list"),
         ({"calibration.basis.buffer": []}, "sweep.0.calibration.basis.buffer: must have at least 1 item(s), has 0"),
         ({"sky.eor.seed": [2, 2]}, "sweep.sky.eor.seed: names the value 2 twice"),
+        (
+            {"corruption.noise.factor": [1, 2], "corruption.noise": [{"kind": "times-eor", "factor": 5}]},
+            "sweep (corruption.noise.factor = 2, corruption.noise = kind times-eor, factor 5): is the same experiment "
+            "as (corruption.noise.factor = 1, corruption.noise = kind times-eor, factor 5); leave out one of them",
+        ),
+        ({"corruption.noise.factor": [1, 1.0]}, "sweep (corruption.noise.factor = 1.0): is the same experiment as"),
         ({"outputs.store": ["a"]}, "sweep.outputs.store: cannot be varied"),
         ({"claibration.chunks": [1]}, "sweep.claibration.chunks: cannot be varied, did you mean 'calibration'?"),
         ({"calibration.chunks.x": [1]}, "'chunks' is 1 and not a block of keys"),
@@ -277,3 +283,28 @@ def test_blocks_as_values_vary_fields_together(folder):
     assert family.members[point.label].instrument.channels.count == 64
     assert point.changes == {"instrument.channels": "first 170 MHz, width 200 kHz, count 64"}
     assert point.label == "01-channels=first170MHzwidth200kHzcount64"
+
+
+def test_blocks_may_have_a_point_in_common(folder):
+    sweep = [{"sky.eor.seed": [2, 12]}, {"corruption.noise.factor": [2, 3]}]
+    family = expand(validate({**small(folder), "sweep": sweep}, folder))
+    first, third = (family.members[family.points[place].label] for place in (0, 2))
+    assert (first.sky.eor.seed, first.corruption) == (third.sky.eor.seed, third.corruption)
+
+
+def test_files_of_points_are_found_beside_the_file_and_by_the_file_in_the_run_folder(tmp_path, monkeypatch):
+    (tmp_path / "beside").mkdir()
+    for name, step in (("one", 14), ("two", 20)):
+        rows = "".join(f"{number},{step * number},{number**2},0\n" for number in range(5))
+        (tmp_path / "beside" / f"{name}.csv").write_text(f"number,east_m,north_m,up_m\n{rows}")
+    data = small(tmp_path, instrument__layout={"kind": "csv", "path": "beside/one.csv"}, instrument__location="mwa")
+    sweep = {"instrument.layout.path": ["beside/one.csv", "beside/two.csv"]}
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump({**data, "sweep": sweep}))
+    monkeypatch.chdir("/")
+    study = load_study(tmp_path / "sweep.yaml")
+    assert [experiment.instrument.layout.path.name for experiment in study.members.values()] == ["one.csv", "two.csv"]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "experiment.yaml").write_text(study.texts["experiment.yaml"])
+    again = load_study(tmp_path / "run" / "experiment.yaml")
+    assert (again.folder.name, list(again.members)) == (study.folder.name, list(study.members))
+    assert [task.key for task in again.targets] == [task.key for task in study.targets]

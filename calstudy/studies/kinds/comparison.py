@@ -42,7 +42,7 @@ from calstudy.products.score import MeasureScore, score
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
-from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of, what_is_made
 from calstudy.studies.preflight import refusal_of_calibrator
 from calstudy.studies.study import KINDS, kind_of
 
@@ -271,7 +271,7 @@ class Comparison(Family):
     @property
     def content(self) -> Any:
         """The experiments of the cases, as far as they decide what is made, and the figures."""
-        cases = [(case.world, case.calibrator, identity(_what_is_made(case.experiment))) for case in self.cases]
+        cases = [(case.world, case.calibrator, identity(what_is_made(case.experiment))) for case in self.cases]
         return {"cases": cases, "figures": identity(self.file.figures)}
 
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
@@ -391,12 +391,6 @@ class WorldData:
         return [*self.data, *(task for task in (self.sky_model, self.levels) if task is not None)]
 
 
-def _what_is_made(experiment: Experiment) -> Experiment:
-    """Return an experiment without the settings of products that only its own run makes."""
-    outputs = experiment.outputs.with_defaults("store", "runs", "figures", "tables")
-    return experiment.model_copy(update={"outputs": outputs}).with_defaults("scales", "name", "description", "papers")
-
-
 def load_worlds(
     path: Path, scale: str | None, overrides: Sequence[str], calibrators: Mapping[str, Any] | None
 ) -> Comparison:
@@ -416,7 +410,7 @@ def load_worlds(
         return Comparison.load(file, calibrators)
     if kind.model is Experiment:
         experiment = file.experiment()
-        kind = type(study_of(experiment))
+        kind = type(study_of(experiment, file.folder))
     if kind is not ExperimentStudy:
         raise InputError(
             f"{file.path}: has the key {kind.key or KINDS.tag!r}; a single experiment or a comparison is needed"
@@ -563,7 +557,7 @@ def _require_different_worlds(members: Mapping[str, Experiment], worlds: Sequenc
     """Raise ExperimentError if two worlds are the same experiment, whose cases would be the same twice."""
     seen: dict[str, str] = {}
     for row, world in enumerate(worlds):
-        same = seen.setdefault(digest_json(identity(_what_is_made(members[case_name(row, 0)]))), world)
+        same = seen.setdefault(digest_json(identity(what_is_made(members[case_name(row, 0)]))), world)
         if same != world:
             raise ExperimentError([f"worlds: {world!r} is the same as {same!r}; change a field in it, or remove it"])
 

@@ -47,11 +47,12 @@ class ExperimentStudy(Study):
     @classmethod
     def load(cls, file: StudyFile) -> Study:
         """Return the study of an experiment, which is of another kind if it has a sweep or realizations."""
-        return study_of(file.experiment())
+        return study_of(file.experiment(), file.folder)
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Study:
+    def of(cls, experiment: Experiment, folder: Path = Path()) -> Study:
         """Return the study of an experiment; raises ExperimentError if there is none of this kind."""
+        del folder
         return cls(experiment)
 
     @cached_property
@@ -232,10 +233,19 @@ def content_of(experiment: Experiment) -> Any:
     return identity(experiment.model_copy(update={"outputs": outputs}).with_defaults("scales"))
 
 
-def study_of(experiment: Experiment) -> Study:
-    """Return the study of an experiment: of the kind whose key it has, such as `sweep`."""
+def what_is_made(experiment: Experiment) -> Experiment:
+    """Return an experiment without the settings of products that only its own run makes."""
+    outputs = experiment.outputs.with_defaults("store", "runs", "figures", "tables")
+    return experiment.model_copy(update={"outputs": outputs}).with_defaults("scales", "name", "description", "papers")
+
+
+def study_of(experiment: Experiment, folder: Path = Path()) -> Study:
+    """Return the study of an experiment: of the kind whose key it has, such as `sweep`.
+
+    Relative paths of files in a sweep start at the folder; all others are absolute.
+    """
     special = KINDS.marked("key", [name for name, value in experiment if value])
-    return (special[0] if special else ExperimentStudy).of(experiment)
+    return (special[0] if special else ExperimentStudy).of(experiment, folder)
 
 
 def describe_setup(experiment: Experiment) -> str:

@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.claims.paper import stand_ins
-from calstudy.experiment.files import StudyFile, override, short_names, validate
+from calstudy.experiment.files import StudyFile, override, short_names, validate, with_absolute_paths
 from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.products.graph import required
 from calstudy.products.signal_loss import SweepSummary, transfer
 from calstudy.run.task import Task
-from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of, what_is_made
 
 SWEPT = ("instrument", "sky", "simulation", "corruption", "calibration", "power", "variants")
 """Sections whose fields can be varied."""
@@ -58,12 +60,12 @@ class Sweep(Family):
     @classmethod
     def load(cls, file: StudyFile) -> Sweep:
         """Return the sweep of a file."""
-        return expand(file.experiment())
+        return expand(file.experiment(), file.folder)
 
     @classmethod
-    def of(cls, experiment: Experiment) -> Sweep:
-        """Return the family of an experiment; errors as for `expand`."""
-        return expand(experiment)
+    def of(cls, experiment: Experiment, folder: Path = Path()) -> Sweep:
+        """Return the family of an experiment; parameters and errors as for `expand`."""
+        return expand(experiment, folder)
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -110,11 +112,11 @@ class Sweep(Family):
         }
 
 
-def expand(experiment: Experiment) -> Sweep:
-    """Return the family of an experiment with a `sweep`.
+def expand(experiment: Experiment, folder: Path = Path()) -> Sweep:
+    """Return the family of an experiment with a `sweep`, whose relative paths of files start at a folder.
 
     Raises ExperimentError with one sentence per fault: a field that cannot be varied, is unknown, or does not take a
-    value, or a point whose fields do not go together.
+    value, a point whose fields do not go together, or points of a block that are the same.
     """
     if not experiment.sweep:
         raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
@@ -132,27 +134,51 @@ def expand(experiment: Experiment) -> Sweep:
     if faults:
         raise ExperimentError(faults)
     plain = experiment.model_dump(mode="json", exclude_unset=True, exclude={"sweep", "scales"})
-    numbers = itertools.count(1)
-    members, blocks = {}, []
+    experiments = []
     for block in experiment.sweep:
-        points = []
-        for values in itertools.product(*block.values()):
-            changes = dict(zip(block, values, strict=True))
-            named = {path: changes[path] for path in varied_fields(block)}
-            texts = {path: text_of(value) for path, value in changes.items()}
-            points.append(Point(_label(next(numbers), named), texts))
-            words = ", ".join(f"{path} = {text}" for path, text in texts.items())
-            try:
-                members[points[-1].label] = _varied(plain, changes, words)
-            except ExperimentError as error:
-                found = [f"sweep ({words}): {fault}" for fault in error.faults]
-                faults += [fault for fault in found if fault not in faults]
-            except InputError as error:
-                faults.append(f"sweep ({words}): {error}")
-        blocks.append(tuple(points))
+        found, told = _experiments(block, plain, folder)
+        experiments += found
+        faults += [fault for fault in told if fault not in faults]
     if faults:
         raise ExperimentError(faults)
-    return Sweep(experiment, members, blocks)
+    swept = with_absolute_paths(experiment.sweep, experiments, folder)
+    numbers = itertools.count(1)
+    blocks = [tuple(_point(next(numbers), changes, block) for changes in _combinations(block)) for block in swept]
+    labels = (point.label for block in blocks for point in block)
+    members = dict(zip(labels, experiments, strict=True))
+    return Sweep(experiment.model_copy(update={"sweep": swept}), members, blocks)
+
+
+def _experiments(
+    block: Mapping[str, Sequence[Any]], plain: Mapping[str, Any], folder: Path
+) -> tuple[list[Experiment], list[str]]:
+    """Return the experiments of the points of a block, and a sentence for every fault."""
+    experiments: list[Experiment] = []
+    faults: list[str] = []
+    seen: dict[str, str] = {}
+    for changes in _combinations(block):
+        words = ", ".join(f"{path} = {text_of(value)}" for path, value in changes.items())
+        try:
+            experiment = _varied(plain, changes, words, folder)
+        except InputError as error:
+            told = error.faults if isinstance(error, ExperimentError) else [str(error)]
+            faults += [f"sweep ({words}): {fault}" for fault in told]
+            continue
+        experiments.append(experiment)
+        same = seen.setdefault(digest_json(identity(what_is_made(experiment))), words)
+        if same != words:
+            faults.append(f"sweep ({words}): is the same experiment as ({same}); leave out one of them")
+    return experiments, faults
+
+
+def _combinations(block: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Return the changes of every point of a block."""
+    return [dict(zip(block, values, strict=True)) for values in itertools.product(*block.values())]
+
+
+def _point(number: int, changes: Mapping[str, Any], block: Mapping[str, Sequence[Any]]) -> Point:
+    named = {path: changes[path] for path in varied_fields(block)}
+    return Point(_label(number, named), {path: text_of(value) for path, value in changes.items()})
 
 
 def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str]:
@@ -164,28 +190,28 @@ def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str
                 f"sweep.{path}: cannot be varied{nearest(section, list(SWEPT))} (a dotted path to a field of: "
                 f"{', '.join(SWEPT)})"
             )
-        texts = [text_of(value) for value in values]
-        faults += [
-            f"sweep.{path}: names the value {text} twice" for text in dict.fromkeys(texts) if texts.count(text) > 1
-        ]
+        texts = [json.dumps(value, sort_keys=True) for value in values]
+        again = (text_of(value) for place, value in enumerate(values) if texts[place] in texts[:place])
+        faults += [f"sweep.{path}: names the value {text} twice" for text in dict.fromkeys(again)]
     return faults
 
 
-def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str) -> Experiment:
+def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str, folder: Path) -> Experiment:
     """Return the experiment of one point."""
     data = dict(plain)
     for path, value in changes.items():
         data = override(data, path, value)
     data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
-    # The paths of input files were made absolute when the file was read.
-    return validate(data, Path("/"))
+    return validate(data, folder)
 
 
 def text_of(value: Any) -> str:
-    """Write a value of a sweep for people: text unchanged, blocks as ``key value``."""
+    """Write a value of a sweep for people: text unchanged, the names of files, blocks as ``key value``."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {text_of(item)}" for key, item in value.items())
-    return value if isinstance(value, str) else json.dumps(value)
+    if isinstance(value, str):
+        return Path(value).name if value.startswith("/") else value
+    return json.dumps(value)
 
 
 def varied_fields(block: Mapping[str, Sequence[Any]]) -> list[str]:
