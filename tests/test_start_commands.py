@@ -66,6 +66,13 @@ def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
     assert copied == {**original, "name": "mine"}
 
 
+def test_the_experiment_of_which_can_be_copied_and_changed(here, capsys):
+    output_of(capsys, "init", "mine", "--example", "which")
+    content = yaml.safe_load((here / "mine.yaml").read_text())
+    assert content == {**yaml.safe_load((published("experiments") / "which.yaml").read_text()), "name": "mine"}
+    assert load_study(here / "mine.yaml", overrides=["worlds={ideal: {}}"]).name == "mine"
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -74,6 +81,7 @@ def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
         (["init", "../mine"], "cannot name an experiment"),
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
         (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
+        (["init", "mine", "--example", "calibrators"], "--example calibrators: is made of other files"),
         (["fields", "--schema", "nowhere/schema.json"], "--schema nowhere/schema.json: cannot be written"),
         (["fields", "--schema", "taken.yaml"], "--schema taken.yaml: is another file, and is not overwritten"),
         (["fields", "calibration", "--schema", "s.json"], "the schema is of whole files; leave out the section"),

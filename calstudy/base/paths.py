@@ -14,7 +14,7 @@ def value_at(content: Any, path: str, missing: Any = None) -> Any:
     for step in path.split("."):
         if isinstance(content, Mapping) and step in content:
             content = content[step]
-        elif isinstance(content, list | tuple) and step.isdigit() and int(step) < len(content):
+        elif isinstance(content, list | tuple) and _is_number(step) and int(step) < len(content):
             content = content[int(step)]
         else:
             return missing
@@ -54,11 +54,16 @@ def _split(block: dict[str, Any] | list[Any], rest: str, path: str) -> tuple[Any
         count = next(dotted, 1)
         step = ".".join(steps[:count])
         return step, step, ".".join(steps[count:])
-    if not steps[0].isdigit() or int(steps[0]) >= len(block):
+    if not _is_number(steps[0]) or int(steps[0]) >= len(block):
         raise InputError(
             f"{path}: cannot be set, for {steps[0]!r} is not an item of a list of {len(block)}, counted from 0"
         )
     return int(steps[0]), steps[0], ".".join(steps[1:])
+
+
+def _is_number(step: str) -> bool:
+    """Return whether a step is a number of plain digits, and not one such as ²."""
+    return step.isascii() and step.isdecimal()
 
 
 def leaves(

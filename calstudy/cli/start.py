@@ -145,7 +145,8 @@ def copy_text(example: str, name: str, schema: Path) -> str:
 
     _require_name(name)
     path = find_experiment(Path(example))
-    if {"experiments", "calibrators"} & set(read_mapping(path)):
+    content = read_mapping(path)
+    if "experiments" in content or isinstance(content.get("experiment"), str):
         raise InputError(f"--example {example}: is made of other files; copy one of those")
     lines = path.read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line.startswith(MODELINE)]

@@ -77,6 +77,17 @@ def _base_60(node: yaml.ScalarNode, number: float) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
 
+def _date(loader: _Loader, node: yaml.ScalarNode) -> None:
+    """Refuse a date, which no field takes: they are texts."""
+    del loader
+    raise yaml.MarkedYAMLError(
+        problem=f"{node.value} is a date in YAML; write it in quotes", problem_mark=node.start_mark
+    )
+
+
+_Loader.add_constructor("tag:yaml.org,2002:timestamp", _date)
+for _kind in ("binary", "set", "omap", "pairs"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", yaml.SafeLoader.construct_undefined)
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 _Loader.add_constructor("tag:yaml.org,2002:float", _real_number)
 

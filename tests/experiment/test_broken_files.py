@@ -100,6 +100,25 @@ def test_object_tags_are_refused_by_name(tmp_path, capsys, monkeypatch):
     assert "python/object/apply:os.system is refused" in message
 
 
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        ("sweep={instrument.times.start: [2020-01-01, 2021-01-01]}", "2020-01-01 is a date in YAML; write it in quotes"),
+        ("description=2020-01-01 12:00:00", "2020-01-01 12:00:00 is a date in YAML; write it in quotes"),
+        ("sweep={sky.eor.seed: [!!binary aGVsbG8=]}", "the tag tag:yaml.org,2002:binary is refused"),
+        ("sweep={sky.eor.seed: [!!set {a}]}", "the tag tag:yaml.org,2002:set is refused"),
+        ("corruption.effects.\u00b2.seed=4", "'\u00b2' is not an item of a list of 1, counted from 0"),
+        ("corruption.effects.\u0660.seed=4", "'\u0660' is not an item of a list of 1, counted from 0"),
+    ],
+)
+def test_what_yaml_or_python_take_for_something_else_is_named(option, told, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    status, message = run_command(capsys, "plan", "file.yaml", "--set", option)
+    assert (status, message.count("\n")) == (REFUSED, 1)
+    assert told in message
+
+
 @pytest.mark.parametrize("file", ["nowhere.yaml", ".", "/dev/null/x.yaml"])
 def test_an_experiment_that_cannot_be_read_is_named(file, capsys):
     status, message = run_command(capsys, "plan", file)
