@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.schema import defaults
 from calstudy.corrupt.interface import GainEffect
 from calstudy.corrupt.noise import NoNoise
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Outputs
+from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 
 PARTS = ("eor", "gains", "noise")
 """Parts that can be drawn again."""
@@ -108,12 +107,6 @@ def _faults(experiment: Experiment) -> list[str]:
         faults.append("realizations: cannot be asked for together with a sweep; use two files")
     if experiment.outputs.tables:
         faults.append("outputs.tables: are tables of single runs, and there are realizations; leave them out")
-    figures = experiment.outputs.figures
-    if figures and figures != defaults(Outputs)["figures"]:
-        faults.append(
-            "outputs.figures: are figures of single runs, and realizations have one of their own; leave them out, or "
-            "set outputs.figures=[]"
-        )
     if not experiment.measures_signal_loss:
         names = ", ".join(SIGNAL_LOSS_VARIANTS)
         faults.append(f"realizations: pool the signal loss, which needs the variants {names}")

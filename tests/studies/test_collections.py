@@ -33,7 +33,7 @@ from calstudy.studies.study import Budget, Run, run_study
 from calstudy.verdicts.tables import from_json
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-NOISES = {"realizations": [{"draw": ["noise"], "count": 2}], "papers": []}
+NOISES = {"realizations": [{"draw": ["noise"], "count": 2}], "papers": [], "outputs.figures": []}
 PAIR = {
     "name": "pair",
     "experiments": [

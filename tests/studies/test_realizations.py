@@ -42,7 +42,7 @@ TWO_BLOCKS = [{"draw": ["gains", "noise"], "count": 4}, {"draw": ["eor"], "count
 def small(folder, **fields) -> dict:
     data = override(tiny(folder), "instrument.layout", {"kind": "mwa-compact-minredundant", "count": 7})
     # The figures of an experiment are drawn elsewhere.
-    cheap = {"simulation.chunks": 1, "calibration.chunks": 1, "outputs.figures": ["layout"]}
+    cheap = {"simulation.chunks": 1, "calibration.chunks": 1, "outputs.figures": []}
     for path, value in {**cheap, "realizations": EVERYTHING}.items():
         data = override(data, path, value)
     for path, value in fields.items():
@@ -311,6 +311,7 @@ def test_the_file_reads_back_from_the_run_folder(finished):
             {"corruption__noise__seeds": [3, 23]},
             "realizations: the seed 23 would be used for noise and for noise (seeds grow by 10",
         ),
+        ({"outputs__figures": ["wedge", "gains"]}, "outputs.figures: are figures of single runs"),
         ({"sweep": {"sky.eor.seed": [2, 3]}}, "realizations: cannot be asked for together with a sweep"),
         (
             {"variants": {"eor": {"components": ["eor"]}}, "outputs__figures": ["layout"]},

@@ -6,9 +6,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from calstudy.base.errors import ExperimentError
+from calstudy.base.schema import defaults
 from calstudy.claims.evaluation import REALIZATIONS, Evaluated
 from calstudy.experiment.files import dump
-from calstudy.experiment.model import FIGURES, Experiment
+from calstudy.experiment.model import FIGURES, Experiment, Outputs
 from calstudy.experiment.realizations import expand_realizations
 from calstudy.figures import figure_task
 from calstudy.products.realizations import pooled
@@ -32,6 +34,15 @@ class Realizations(ExperimentStudy):
 
     def __init__(self, experiment: Experiment, folder: Path | None = None) -> None:
         expand_realizations(experiment)
+        figures = experiment.outputs.figures
+        # Those of every single run are the default.
+        if figures and figures != defaults(Outputs)["figures"]:
+            raise ExperimentError(
+                [
+                    "outputs.figures: are figures of single runs, and realizations have one of their own; leave them "
+                    "out, or set outputs.figures=[]"
+                ]
+            )
         super().__init__(experiment, folder)
 
     @cached_property
