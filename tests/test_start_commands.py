@@ -225,6 +225,32 @@ def test_nothing_is_deleted_unasked_and_what_runs_were_made_from_is_kept(used_st
     assert keys(used_store) == {"a", "b"}
 
 
+def test_products_of_runs_behind_links_are_kept(used_store, here, capsys):
+    (here / "disk").mkdir()
+    (here / "runs" / "mine-1234").rename(here / "disk" / "mine-1234")
+    (here / "runs" / "mine-1234").symlink_to(here / "disk" / "mine-1234")
+    # A link that leads back up is followed once.
+    (here / "disk" / "mine-1234" / "up").symlink_to(here / "runs")
+    assert output_of(capsys, "runs").count("mine-1234") == 1
+    output_of(capsys, "store", "--unreferenced", "--delete")
+    assert keys(used_store) == {"a", "b"}
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"name": "mine", "products": [{}]}'])
+def test_nothing_counts_as_unreferenced_where_a_run_cannot_be_read(used_store, here, capsys, text):
+    (here / "runs" / "mine-1234" / "manifest.json").write_text(text)
+    status, told = run_command(capsys, "store", "--unreferenced", "--delete")
+    assert (status, told.count("\n")) == (REFUSED, 1)
+    assert "mine-1234: its manifest.json cannot be read" in told
+    assert keys(used_store) == {"a", "b", "c", "d"}
+
+
+def test_exported_data_among_runs_are_no_run(used_store, here, capsys):
+    (here / "runs" / "exported").mkdir()
+    (here / "runs" / "exported" / "manifest.json").write_text('{"calstudy": "1", "digest": "", "data": []}')
+    assert "2 products" in output_of(capsys, "store", "--unreferenced")
+
+
 def test_a_store_is_verified_and_what_is_damaged_is_named(used_store, capsys):
     assert "4 products" in output_of(capsys, "store", "--verify")
     (used_store.folder("average", key_of("a")) / "data.bin").write_bytes(b"y" * 1000)

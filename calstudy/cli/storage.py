@@ -63,7 +63,7 @@ def store(
     deleted with --older-than. Without --delete nothing is changed; with it, at least one of --older-than,
     --larger-than, --unreferenced and --verify must choose the products.
     """
-    from calstudy.results.reader import find_runs
+    from calstudy.results.reader import keys_of_runs
     from calstudy.run.store import Store, age_of, leftovers, products
     from calstudy.run.store import unreferenced as without_run
 
@@ -79,7 +79,7 @@ def store(
         raise InputError("--delete: say which products by --older-than, --larger-than, --unreferenced or --verify")
     where, chosen = Store(folder), list(products(Store(folder)))
     if unreferenced:
-        chosen = without_run(chosen, [key for run in find_runs(runs) for key in run.keys])
+        chosen = without_run(chosen, keys_of_runs(runs))
     chosen = [product for product in chosen if age_of(product) >= oldest and product.size >= smallest]
     console = Console(highlight=False)
     _show(chosen, folder, console)

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -396,10 +397,50 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def find_runs(folder: Path) -> list[RunFolder]:
     """Return the finished runs in a folder and its subfolders, the latest first; raises InputError without a folder."""
+    return sorted(filter(_is_readable, _runs_in(folder)), key=lambda run: run.finished, reverse=True)
+
+
+def keys_of_runs(folder: Path) -> set[str]:
+    """Return the keys of the products of all runs in a folder and its subfolders.
+
+    Raises InputError without a folder, and for a folder, or the manifest of a run, that cannot be read.
+    """
+
+    def stop(error: OSError) -> NoReturn:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}), and may hold runs")
+
+    found: set[str] = set()
+    for run in _runs_in(folder, stop):
+        try:
+            content = json.loads((run.path / MANIFEST).read_text(encoding="utf-8"))
+            # Exported data have another manifest, without a name.
+            found |= run.keys if content.get("name") is not None else frozenset()
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            raise InputError(
+                f"{run.path}: its {MANIFEST} cannot be read, so that its products are not known; run the study again, "
+                "or remove the folder"
+            ) from None
+    return found
+
+
+def _runs_in(folder: Path, told: Callable[[OSError], None] | None = None) -> list[RunFolder]:
+    """Return all runs in a folder and its subfolders, which may be links; a folder that is found twice counts once.
+
+    Of a folder that cannot be read, `told` gets the error.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of runs")
-    runs = (RunFolder(path.parent) for path in sorted(folder.rglob(MANIFEST)))
-    return sorted(filter(_is_readable, runs), key=lambda run: run.finished, reverse=True)
+    found, seen = [], set()
+    for place, inside, files in os.walk(folder, onerror=told, followlinks=True):
+        # A link may lead to a folder above it.
+        if (real := os.path.realpath(place)) in seen:
+            inside.clear()
+            continue
+        seen.add(real)
+        inside.sort()
+        if MANIFEST in files:
+            found.append(RunFolder(Path(place)))
+    return found
 
 
 def _is_readable(run: RunFolder) -> bool:
