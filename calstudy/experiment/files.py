@@ -87,7 +87,7 @@ def _date(loader: _Loader, node: yaml.ScalarNode) -> None:
 
 _Loader.add_constructor("tag:yaml.org,2002:timestamp", _date)
 for _kind in ("binary", "set", "omap", "pairs"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", yaml.SafeLoader.construct_undefined)
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.construct_undefined)
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 _Loader.add_constructor("tag:yaml.org,2002:float", _real_number)
 

@@ -103,7 +103,10 @@ def test_object_tags_are_refused_by_name(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("option", "told"),
     [
-        ("sweep={instrument.times.start: [2020-01-01, 2021-01-01]}", "2020-01-01 is a date in YAML; write it in quotes"),
+        (
+            "sweep={instrument.times.start: [2020-01-01, 2021-01-01]}",
+            "2020-01-01 is a date in YAML; write it in quotes",
+        ),
         ("description=2020-01-01 12:00:00", "2020-01-01 12:00:00 is a date in YAML; write it in quotes"),
         ("sweep={sky.eor.seed: [!!binary aGVsbG8=]}", "the tag tag:yaml.org,2002:binary is refused"),
         ("sweep={sky.eor.seed: [!!set {a}]}", "the tag tag:yaml.org,2002:set is refused"),
