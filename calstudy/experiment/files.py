@@ -85,9 +85,14 @@ def _date(loader: _Loader, node: yaml.ScalarNode) -> None:
     )
 
 
+def _unknown(loader: _Loader, node: yaml.Node) -> None:
+    """Refuse a tag that YAML knows and no field takes, as one that it does not know."""
+    loader.construct_undefined(node)
+
+
 _Loader.add_constructor("tag:yaml.org,2002:timestamp", _date)
 for _kind in ("binary", "set", "omap", "pairs"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.construct_undefined)
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _unknown)
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 _Loader.add_constructor("tag:yaml.org,2002:float", _real_number)
 
