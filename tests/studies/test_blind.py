@@ -155,12 +155,13 @@ def test_no_effect_of_a_recipe_is_that_of_the_public_file_also_if_it_is_the_defa
     assert not open_seeds & secret_seeds
 
 
-def test_a_seed_that_the_file_sets_before_it_sets_the_effects_does_not_come_back(tmp_path):
+def test_a_seed_that_a_world_sets_before_it_sets_the_effects_does_not_come_back(tmp_path):
     file = tmp_path / "plain.yaml"
-    file.write_text(yaml.safe_dump({"name": "plain", "instrument": {"layout": "hera-19"}}))
-    effects = "corruption.effects=[{kind: per-channel-gains, seed: 77}]"
-    worlds = load_worlds(file, None, ["corruption.effects.0.seed=76", effects], CARRIER)
-    write_recipe(worlds, tmp_path / "recipe.yaml")
+    changes = {"corruption.effects.0.seed": 76, "corruption.effects": [{"kind": "per-channel-gains", "seed": 77}]}
+    base = {"name": "base", "instrument": {"layout": "hera-19"}}
+    content = {"name": "plain", "experiment": base, "calibrators": {"none": "none"}, "worlds": {"one": changes}}
+    file.write_text(yaml.safe_dump(content, sort_keys=False))
+    write_recipe(load_worlds(file, None, (), None), tmp_path / "recipe.yaml")
     [case] = load_worlds(tmp_path / "recipe.yaml", None, (), CARRIER).cases
     assert case.experiment.corruption.effects[0].seed > 2 ** (BITS // 2)
 
