@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ TINY: dict[str, Any] = {
 
 
 def tiny(folder: Path) -> dict[str, Any]:
-    """Return the tiny experiment with its store and runs in `folder`."""
-    return {**TINY, "outputs": {"store": str(folder / "store"), "runs": str(folder / "runs")}}
+    """Return the tiny experiment with its store and runs in `folder`; changes of it change no other."""
+    return {**deepcopy(TINY), "outputs": {"store": str(folder / "store"), "runs": str(folder / "runs")}}
 
 
 def of_the_paper(folder: Path) -> dict[str, Any]:
