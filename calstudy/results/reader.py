@@ -423,15 +423,15 @@ def keys_of_runs(folder: Path) -> set[str]:
     return found
 
 
-def _runs_in(folder: Path, told: Callable[[OSError], None] | None = None) -> list[RunFolder]:
+def _runs_in(folder: Path, on_error: Callable[[OSError], None] | None = None) -> list[RunFolder]:
     """Return all runs in a folder and its subfolders, which may be links; a folder that is found twice counts once.
 
-    Of a folder that cannot be read, `told` gets the error.
+    `on_error` is called with the error of a folder that cannot be read; by default it is left out.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of runs")
     found, seen = [], set()
-    for place, inside, files in os.walk(folder, onerror=told, followlinks=True):
+    for place, inside, files in os.walk(folder, onerror=on_error, followlinks=True):
         # A link may lead to a folder above it.
         if (real := os.path.realpath(place)) in seen:
             inside.clear()

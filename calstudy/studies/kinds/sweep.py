@@ -136,9 +136,9 @@ def expand(experiment: Experiment, folder: Path = Path()) -> Sweep:
     plain = experiment.model_dump(mode="json", exclude_unset=True, exclude={"sweep", "scales"})
     experiments = []
     for block in experiment.sweep:
-        found, told = _experiments(block, plain, folder)
+        found, faults_of_block = _experiments(block, plain, folder)
         experiments += found
-        faults += [fault for fault in told if fault not in faults]
+        faults += [fault for fault in faults_of_block if fault not in faults]
     if faults:
         raise ExperimentError(faults)
     swept = with_absolute_paths(experiment.sweep, experiments, folder)
@@ -161,8 +161,8 @@ def _experiments(
         try:
             experiment = _varied(plain, changes, words, folder)
         except InputError as error:
-            told = error.faults if isinstance(error, ExperimentError) else [str(error)]
-            faults += [f"sweep ({words}): {fault}" for fault in told]
+            sentences = error.faults if isinstance(error, ExperimentError) else [str(error)]
+            faults += [f"sweep ({words}): {fault}" for fault in sentences]
             continue
         experiments.append(experiment)
         same = seen.setdefault(digest_json(identity(what_is_made(experiment))), words)
