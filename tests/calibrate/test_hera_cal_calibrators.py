@@ -152,6 +152,31 @@ def test_cells_with_the_same_weights_are_solved_together(monkeypatch):
     np.testing.assert_allclose(together, apart, rtol=1e-10)
 
 
+def test_a_pass_after_one_that_converged_starts_from_its_gains(monkeypatch):
+    """All steps of every pass lead to the same gains: here with baselines that are redundant to some percent."""
+    toy = make_toy(LARGE_HEX, noise=0.0)
+    uvd = make_uvdata(toy, n_times=2)
+    cube = to_cube(uvd) * (1 + 0.03 * complex_normal(np.random.default_rng(8), to_cube(uvd).shape))
+    uvd, sky = from_cube(uvd, cube), sky_of(uvd, toy.foregrounds)
+    found, firsts = {}, {}
+    true = RedundantCalibrator.firstcal
+    for again in (redcal.AGAIN, redcal.STEPS):
+        calls = []
+        monkeypatch.setattr(redcal, "AGAIN", again)
+        monkeypatch.setattr(
+            RedundantCalibrator,
+            "firstcal",
+            lambda *args, calls=calls, **more: (calls.append(1), true(*args, **more))[1],
+        )
+        result = run_calibrator(Redcal(), uvd, sky)
+        assert statuses(result) == ["converged"] * 2
+        assert result.solutions[0].diagnostics["passes"] > 1
+        found[again], firsts[again] = result.gains.gain_array, len(calls)
+    # Omnical stops when gains change by 1e-8, with 0.3 of each step.
+    np.testing.assert_allclose(found[redcal.STEPS], found[("omnical", "abscal")], rtol=0, atol=1e-6)
+    assert firsts[("omnical", "abscal")] == 2 < firsts[redcal.STEPS]
+
+
 def test_abscal_turns_the_sky_to_where_the_model_has_it():
     """Sources that the model has elsewhere by one angle are a phase gradient of the gains, which redundancy allows."""
     toy = make_toy(LARGE_HEX, noise=0.0)

@@ -21,7 +21,7 @@ from calstudy.base.gain_files import read_h5parm
 from calstudy.base.observation import Frame
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.units import Frequency
-from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage
+from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage, Solved
 from calstudy.calibrate.interface import Solve
 from calstudy.instrument.settings import Size
 
@@ -70,12 +70,10 @@ class Ddecal(OtherPackage):
         seconds = 5 + 8 * size.polarizations + 4e-5 * size.samples
         return Cost(seconds, LIBRARIES_MEMORY + 12 * CORRELATIONS * COMPLEX64 * samples)
 
-    def solve(
-        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Solve]]:
+    def solve(self, measured: Measured, groups: list[slice], before: Solved | None = None) -> Solved:
         """Solve every group of integrations."""
-        if start is not None:
-            measured = measured.weighted_by(start, groups)
+        if before is not None:
+            measured = measured.weighted_by(before.gains, groups)
         with TemporaryDirectory(prefix="ddecal-") as name:
             folder = Path(name)
             _write_measurement_set(folder, measured, groups)
@@ -85,14 +83,14 @@ class Ddecal(OtherPackage):
             if ended.returncode != 0:
                 last = (ended.stdout.strip().splitlines() or ["it said nothing"])[-1]
                 outcome = Solve(status="failed", message=f"DP3 ended with exit code {ended.returncode}: {last}")
-                return np.full(shape, np.nan, complex), [outcome] * len(groups)
+                return Solved(np.full(shape, np.nan, complex), [outcome] * len(groups))
             table = read_h5parm(folder / "gains.h5")
         assert table.antennas is not None, "an H5Parm file has names"
         order = np.argsort([int(name) for name in table.antennas])
         gains = table.gains[order, :, : len(groups), 0]
         # A solution without data is one, NaN, or a copy of the previous solution.
         known = [measured.frame.antennas_of(measured.weights[times].max(axis=0) > 0) for times in groups]
-        return np.where(np.stack(known, axis=2), gains, np.nan), self._outcomes(ended.stdout, len(groups))
+        return Solved(np.where(np.stack(known, axis=2), gains, np.nan), self._outcomes(ended.stdout, len(groups)))
 
     def _run(self, folder: Path) -> subprocess.CompletedProcess[str]:
         """Run DDECal on the measurement set of a folder."""

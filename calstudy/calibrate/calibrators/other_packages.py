@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -54,6 +55,13 @@ class Measured:
         return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
 
 
+class Solved(NamedTuple):
+    """Gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how the solve of each group ended."""
+
+    gains: np.ndarray
+    outcomes: list[Solve]
+
+
 class OtherPackage(WeightedFit):
     """A calibrator that finds only gains; the residual is that of the sky model."""
 
@@ -70,14 +78,12 @@ class OtherPackage(WeightedFit):
         return None
 
     @abstractmethod
-    def solve(
-        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Solve]]:
-        """Return gains, complex, (Nants, Nfreqs, Ngroups), NaN where there are none, and how each solve ended.
+    def solve(self, measured: Measured, groups: list[slice], before: Solved | None = None) -> Solved:
+        """Solve every group of integrations.
 
-        The data are of one polarization, with weight in each group of integrations. `start` is None in the first pass.
-        If weights come from the gains, `start` are the gains of the previous pass; the weights are then those of
-        `measured` over |g_a g_b|^2 of these gains (`Measured.weighted_by`).
+        The data are of one polarization, with weight in each group. `before` is None in the first pass. If weights come
+        from the gains, it is the previous pass; the weights are then those of `measured` over |g_a g_b|^2 of its gains
+        (`Measured.weighted_by`).
         """
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
@@ -136,24 +142,24 @@ class OtherPackage(WeightedFit):
                 )
         return gains, ended
 
-    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Solve]]:
+    def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> Solved:
         """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle."""
         settings, weights = self.weights, measured.weights
-        gains, outcomes = self.solve(measured, groups)
+        solved = first = self.solve(measured, groups)
         if not isinstance(settings, GainWeights):
-            return gains, outcomes
-        first, passes = gains, 1
+            return solved
+        passes = 1
         while True:
-            before, weights = weights, measured.weighted_by(gains, groups).weights
+            before, weights = weights, measured.weighted_by(solved.gains, groups).weights
             changes = [weight_change(weights[times], before[times]) for times in groups]
             if passes == settings.passes or max(changes) < settings.tolerance:
                 break
-            gains, outcomes = self.solve(measured, groups, gains)
+            solved = self.solve(measured, groups, solved)
             passes += 1
-        if settings.passes > 1:
-            gains = np.where(np.array(changes) > RUNAWAY, first, gains)
+        gains = np.where(np.array(changes) > RUNAWAY, first.gains, solved.gains) if passes > 1 else solved.gains
         unsettled = [settings.unsettled(found) for found in changes]
-        return gains, [_in_passes(*ended, passes) for ended in zip(outcomes, changes, unsettled, strict=True)]
+        ended = zip(solved.outcomes, changes, unsettled, strict=True)
+        return Solved(gains, [_in_passes(*each, passes) for each in ended])
 
 
 def _in_passes(outcome: Solve, change: float, unsettled: bool, passes: int) -> Solve:
@@ -221,17 +227,15 @@ class Skycal(OtherPackage):
         solve = size.samples * self.integrations_per_solve / (size.times * size.polarizations)
         return Cost(seconds, LIBRARIES_MEMORY + COMPLEX128 * (6 * size.samples + 12 * solve))
 
-    def solve(
-        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Solve]]:
+    def solve(self, measured: Measured, groups: list[slice], before: Solved | None = None) -> Solved:
         """Solve every group of integrations, by the baselines between boards if there are any."""
         if self.boards is not None:
             between = ~self.boards.within(measured.frame)[:, None]
             measured = replace(measured, weights=np.where(between, measured.weights, 0))
-        if start is not None:
-            measured = measured.weighted_by(start, groups)
-        found = [self._solve_group(measured, times) for times in groups]
-        return np.stack([gains for gains, _ in found], axis=2), [outcome for _, outcome in found]
+        if before is not None:
+            measured = measured.weighted_by(before.gains, groups)
+        gains, outcomes = zip(*(self._solve_group(measured, times) for times in groups), strict=True)
+        return Solved(np.stack(gains, axis=2), list(outcomes))
 
     def _solve_group(self, measured: Measured, times: slice) -> tuple[np.ndarray, Solve]:
         """Return gains (Nants, Nfreqs), NaN where there are none.

@@ -12,7 +12,7 @@ from calstudy.base.observation import Frame
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import fault
 from calstudy.base.units import Length
-from calstudy.calibrate.calibrators.other_packages import FEED, POL, Measured, OtherPackage, patterns
+from calstudy.calibrate.calibrators.other_packages import FEED, POL, Measured, OtherPackage, Solved, patterns
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.interface import Solve
 from calstudy.calibrate.problem import gain_products
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 Step = Literal["firstcal", "logcal", "omnical", "abscal"]
 STEPS: tuple[Step, ...] = ("firstcal", "logcal", "omnical", "abscal")
+AGAIN: tuple[Step, ...] = ("omnical", "abscal")
+"""The steps of a pass that starts from the gains of another."""
 SAMPLES_AT_ONCE = 4e6
 NEGLIGIBLE = 1e-14
 """Weight of the sky model in place of samples without weight, relative to the largest weight."""
@@ -50,8 +52,9 @@ class Redcal(OtherPackage):
     amplitude and phase gradient that redundancy leaves free (Liu et al. 2010; Kern et al. 2020; Byrne et al. 2019).
     """
 
-    # Amplitude and phase gradient have the weights of calibrated data since 2.
-    version: ClassVar[int] = 2
+    # Amplitude and phase gradient have the weights of calibrated data since 2; passes after one that converged start
+    # from its gains since 3.
+    version: ClassVar[int] = 3
     calibrator: str = "redcal"
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     steps: Annotated[tuple[Step, ...], Field(strict=False, min_length=1)] = Field(
@@ -86,12 +89,10 @@ class Redcal(OtherPackage):
         at_once = max(SAMPLES_AT_ONCE, size.baselines * size.channels.count)
         return Cost(seconds, LIBRARIES_MEMORY + COMPLEX128 * (6 * size.samples + 25 * min(size.samples, at_once)))
 
-    def solve(
-        self, measured: Measured, groups: list[slice], start: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Solve]]:
+    def solve(self, measured: Measured, groups: list[slice], before: Solved | None = None) -> Solved:
         """Solve every integration by itself, and average gains that integrations share, with aligned phases."""
-        if start is not None:
-            return self._solve_again(measured, groups, start)
+        if before is not None:
+            return self._solve_again(measured, groups, before)
         found = redundant_groups(measured.frame.vectors, self.redundancy_tolerance)
         n_times, n_baselines, n_channels = measured.visibilities.shape
         step = max(int(SAMPLES_AT_ONCE // (n_baselines * n_channels)), 1)
@@ -101,21 +102,22 @@ class Redcal(OtherPackage):
         ]
         gains, status, steps = (np.concatenate(parts, axis=-2) for parts in zip(*blocks, strict=True))
         shared = np.stack([_average(gains[:, times]) for times in groups], axis=2)
-        return shared, [self._outcome(status[times], steps[times]) for times in groups]
+        return Solved(shared, [self._outcome(status[times], steps[times]) for times in groups])
 
-    def _solve_again(
-        self, measured: Measured, groups: list[slice], start: np.ndarray
-    ) -> tuple[np.ndarray, list[Solve]]:
+    def _solve_again(self, measured: Measured, groups: list[slice], before: Solved) -> Solved:
         """Solve data divided by the gains of the previous pass, with the weights of unity gains.
 
-        These weights are equal if nothing is flagged, which logcal needs for its speed.
+        These weights are equal if nothing is flagged, which logcal needs for its speed. Where the previous pass
+        converged, its gains are so close that omnical needs no other start.
         """
-        known = np.where(np.isfinite(start) & (start != 0), start, 1)
+        known = np.where(np.isfinite(before.gains) & (before.gains != 0), before.gains, 1)
         visibilities = measured.visibilities.copy()
         for number, times in enumerate(groups):
             visibilities[times] /= gain_products(known[..., number], measured.frame.antennas)
-        gains, outcomes = self.solve(replace(measured, visibilities=visibilities), groups)
-        return gains * known, outcomes
+        near = "omnical" in self.steps and all(outcome.status == "converged" for outcome in before.outcomes)
+        again = self.model_copy(update={"steps": tuple(step for step in AGAIN if step in self.steps)}) if near else self
+        gains, outcomes = again.solve(replace(measured, visibilities=visibilities), groups)
+        return Solved(gains * known, outcomes)
 
     def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Solve:
         """Return how a solve ended, from the status of its channels in `_Redundant.solve`."""

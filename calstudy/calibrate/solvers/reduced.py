@@ -336,7 +336,7 @@ def compiled(
 
 
 # By positional arguments alone, because a cache takes others for different ones.
-_kernels = lru_cache(maxsize=6)(ReducedKernels)
+_kernels = lru_cache(maxsize=8)(ReducedKernels)
 
 
 def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float:
