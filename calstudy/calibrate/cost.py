@@ -12,6 +12,7 @@ from calstudy.calibrate.settings import (
     BasisSettings,
     ForegroundFit,
     GainFit,
+    GainWeights,
     GaussNewtonSettings,
 )
 from calstudy.instrument.settings import Channels, Size
@@ -30,17 +31,20 @@ EXTRA_RANK = 14
 # Vectors of a basis beyond its time-bandwidth product, for the default eigenvalue cutoff.
 EXTRA_VECTORS = 14
 PAPER_SAMPLES = 630 * 384
-# Seconds of one core for the paper's samples. Gauss-Newton: a first solve, and one from the solution before with the
-# sky model as foregrounds, and with foregrounds that are free or have a finite prior, at some tolerance. Free ones take
-# more the lower the tolerance, 0.4 s at 1e-3 and 6 s at 1e-5; those with a prior the wider it is: 0.4 s at 0.1, 5 at 1.
-COLD_SECONDS = 1.5
-FROZEN_SECONDS, FREE_SECONDS, FINITE_SECONDS = 0.1, 0.4, 0.4
+# Seconds of one core for the paper's samples with Gauss-Newton, where foregrounds are the sky model, free, or have a
+# finite prior: a first solve, and one from the solution before. Free ones take more the lower the tolerance, 0.4 s at
+# 1e-3 and 6 s at 1e-5; those with a prior the wider it is: 1 s at 0.1, 10 at 1.
+FROZEN_COLD, FREE_COLD, FINITE_COLD = 0.25, 1.5, 4.0
+FROZEN_SECONDS, FREE_SECONDS, FINITE_SECONDS = 0.1, 0.4, 1.0
 FREE_TOLERANCE, FREE_POWER = 1e-3, -0.6
 FINITE_DEVIATION = 0.1
 # With its passes and probes.
-ESTIMATED_SECONDS = 2.0
+ESTIMATED_SECONDS = 6.0
 # Compilation takes 3 s and more; pieces with the same baselines in one process share it, so that most have none.
 START_SECONDS = 1.5
+# With weights from the gains, or an estimated prior, a first solve is repeated, and every solve has calls that do not
+# depend on its size.
+PASSES, PASSES_SECONDS, SEARCH_SECONDS = 2.0, 0.4, 1.2
 ADAMAX_STEP = 4e-3
 
 
@@ -156,10 +160,20 @@ def _seconds(settings: GainFit, solves: float, samples: int) -> float:
     work, solver = samples / PAPER_SAMPLES, settings.solver
     if isinstance(solver, GaussNewtonSettings):
         warm = max(solves - 1, 0) if solver.warm_start else 0
-        seconds = _warm_seconds(settings, solver.tolerance)
+        passes, each = (PASSES, PASSES_SECONDS) if isinstance(settings.weights, GainWeights) else (1.0, 0.0)
+        if settings.estimates_deviation:
+            passes, each = PASSES, SEARCH_SECONDS
+        cold, seconds = _cold_seconds(settings) * passes, _warm_seconds(settings, solver.tolerance)
         # Cost of the normal matrices, baselines x channels x vectors^2, dominates.
-        return START_SECONDS + ((solves - warm) * max(COLD_SECONDS, seconds) + warm * seconds) * work
+        return START_SECONDS + each * solves + ((solves - warm) * max(cold, seconds) + warm * seconds) * work
     return 6 + ADAMAX_STEP * work * solves * solver.max_steps
+
+
+def _cold_seconds(settings: GainFit) -> float:
+    """Return the seconds of a first Gauss-Newton solve of the paper's samples, in one pass."""
+    if not isinstance(settings, ForegroundFit) or settings.frozen:
+        return FROZEN_COLD
+    return FINITE_COLD if settings.foreground_prior.finite else FREE_COLD
 
 
 def _warm_seconds(settings: GainFit, tolerance: float) -> float:

@@ -208,7 +208,7 @@ class Calibrate(Task, stage="calibrate", version=2):
 
     def _cost(self) -> Cost:
         disk = 2 * size_of(self).samples * COMPLEX64
-        return Cost(0.7 + disk * 5e-9, LIBRARIES_MEMORY + 3 * disk, disk)
+        return Cost(0.2 + disk * 6e-9, LIBRARIES_MEMORY + 3 * disk, disk)
 
 
 def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) -> list[str]:

@@ -174,7 +174,7 @@ class Comparison(Task, stage="comparison", version=7):
         size = size_of(self)
         # Spectra of two cases, and what their units owe to two antennas each.
         held = 2 * len(SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
-        return Cost(2 + cases * (0.5 + held * 1e-8), LIBRARIES_MEMORY + held, 1e6)
+        return Cost(2 + cases * (0.1 + held * 2e-9), LIBRARIES_MEMORY + held, 1e6)
 
 
 def _csv_rows(cases: Mapping[str, Mapping[str, Case]]) -> Iterator[dict[str, Any]]:

@@ -236,7 +236,8 @@ class MeasureLevels(Task, stage="levels", version=2):
     def _cost(self) -> Cost:
         noise = self.corruption.noise
         beam = 10 if isinstance(noise, RadiometerNoise) and noise.effective_area is None else 0
-        return Cost(0.5 + beam, LIBRARIES_MEMORY + 3 * size_of(self).samples * COMPLEX128, 1e5)
+        samples = size_of(self).samples
+        return Cost(0.2 + 1.5e-7 * samples + beam, LIBRARIES_MEMORY + 3 * samples * COMPLEX128, 1e5)
 
 
 class Corrupt(Task, stage="corrupt", version=2):
@@ -286,7 +287,7 @@ class Corrupt(Task, stage="corrupt", version=2):
     def _cost(self) -> Cost:
         size = size_of(self)
         effects = [effect.cost(size) for effect in self.effects]
-        seconds = 1 + size.samples * 1e-7 + sum(cost.seconds for cost in effects)
+        seconds = 0.2 + size.samples * 1.3e-7 + sum(cost.seconds for cost in effects)
         memory = LIBRARIES_MEMORY + 5 * size.samples * COMPLEX128 + max((cost.memory for cost in effects), default=0.0)
         return Cost(seconds, memory, size.samples * COMPLEX64)
 
@@ -319,7 +320,7 @@ class Autocorrelate(Task, stage="autocorrelations", version=1):
     def _cost(self) -> Cost:
         size = size_of(self)
         disk = size.antennas * size.channels.count * size.times * size.polarizations * COMPLEX64
-        return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, disk)
+        return Cost(0.2 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, disk)
 
 
 def _cost_of_gains(task: Task, effects: Sequence[Effect]) -> Cost:
@@ -327,4 +328,4 @@ def _cost_of_gains(task: Task, effects: Sequence[Effect]) -> Cost:
     size = size_of(task)
     times = size.times if any(isinstance(effect, GainEffect) and effect.varies for effect in effects) else 1
     disk = size.antennas * size.channels.count * times * size.polarizations * COMPLEX128
-    return Cost(1 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, 1e6 + disk)
+    return Cost(0.2 + disk * 1e-7, LIBRARIES_MEMORY + 8 * disk, 1e6 + disk)

@@ -244,10 +244,10 @@ def cost_of_responses(task: Solved, responses: int, memory: float) -> Cost:
     size = size_of(task)
     samples = size.baselines * size.channels.count * task.calibrator.integrations_per_solve
     work = samples / PAPER_SAMPLES
-    return Cost(6 + 0.8 * responses * work, LIBRARIES_MEMORY + memory * work, 1e6)
+    return Cost(1 + 0.8 * responses * work, LIBRARIES_MEMORY + memory * work, 1e6)
 
 
-class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(1, disk=1e4)):
+class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(0.1, disk=1e4)):
     """T and C of the linear response of one integration to the EoR, in two realizations of the noise."""
 
     power: PowerSettings

@@ -132,7 +132,7 @@ class Difference(Task, stage="difference", version=2):
 
     def _cost(self) -> Cost:
         blocks = blocks_in(self.inputs.values())
-        return Cost(0.3 * blocks, disk=blocks * size_of(self).baselines * 1e4)
+        return Cost(0.1 * blocks, disk=blocks * size_of(self).baselines * 1e4)
 
 
 class Injected(Task):
@@ -286,7 +286,7 @@ class FluxScale(Task, stage="flux-scale", version=1):
         return gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values))
 
     def _cost(self) -> Cost:
-        return Cost(0.5 + size_of(self).samples * 2.5e-7, disk=1e3)
+        return Cost(0.1 + size_of(self).samples * 6e-8, disk=1e3)
 
 
 def _with_error(value: float, error: float) -> str:

@@ -200,7 +200,7 @@ class Simulate(_Simulated, stage="simulate", version=3):
 
     def _cost(self) -> Cost:
         disk = size_of_instrument(self.instrument).samples * COMPLEX128
-        return Cost(2 + disk * 2e-9, LIBRARIES_MEMORY + 4 * disk, disk)
+        return Cost(0.4 + disk * 1.7e-8, LIBRARIES_MEMORY + 4 * disk, disk)
 
 
 def _warnings(component: Component, quality: Mapping[str, Any]) -> list[str]:

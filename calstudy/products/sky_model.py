@@ -150,4 +150,4 @@ class SkyModelError(Task, stage="sky-model-error", version=1):
 
     def _cost(self) -> Cost:
         samples = size_of(self).samples
-        return Cost(0.3 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)
+        return Cost(0.1 + samples * 1e-7, LIBRARIES_MEMORY + 4 * samples * COMPLEX128, 1e3)

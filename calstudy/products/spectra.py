@@ -134,7 +134,7 @@ class Average(InBlocks, stage="average", version=2):
     def _cost(self) -> Cost:
         size, blocks = size_of(self), self.blocks
         disk = blocks * size.samples / size.times * COMPLEX128
-        seconds = 0.5 + 0.15 * (blocks - 1) + size.samples * 8e-8
+        seconds = 0.1 + 0.15 * (blocks - 1) + size.samples * 1.2e-7
         return Cost(seconds, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
 
 
@@ -173,7 +173,8 @@ class Power(Task, stage="power", version=4):
         size, blocks = size_of(self), blocks_in([self.even, self.odd, *behind])
         # Each block has a file of the estimator; spectra and each unit's shares of its antennas are of all blocks.
         spectra = size.baselines * size.channels.count
-        seconds = 2 + 4e-6 * spectra + (blocks - 1) * (0.9 + 0.002 * size.baselines)
+        seconds = 0.3 + 6e-4 * size.baselines * (1 + (size.baselines / 2000) ** 2)
+        seconds += (blocks - 1) * (0.9 + 0.002 * size.baselines)
         return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
 
 
@@ -182,7 +183,7 @@ def read_delay_spectra(folder: Path) -> DelaySpectra:
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
 
-class Spectra(Task, stage="spectra", version=4, cost=Cost(2, disk=5e6)):
+class Spectra(Task, stage="spectra", version=4):
     """Wedge and spherical spectra of all variants, with errors.
 
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
@@ -214,6 +215,10 @@ class Spectra(Task, stage="spectra", version=4, cost=Cost(2, disk=5e6)):
                 save_spectrum(output / spectrum_file(name, modes), spectrum)
                 write_csv(output / f"{name}.{modes}.csv", spectrum)
         return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
+
+    def _cost(self) -> Cost:
+        baselines = size_of(self).baselines
+        return Cost(0.5 + 2e-3 * baselines + 1e-6 * baselines**2, disk=5e6)
 
 
 def blocks_in(averages: Iterable[Task]) -> int:
