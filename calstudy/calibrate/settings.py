@@ -51,7 +51,8 @@ class GaussNewtonSettings(Section):
         "single",
         description="Of the inner products of the iteration. Where the noise is below about 3e-4 of the data, some "
         "directions are not resolved by single precision: `double` goes on with less damping, and `single` is "
-        "`stalled` if more than 1 % of the loss (or `tolerance`, if that is larger) is predicted to go there.",
+        "`stalled` if more than 1 % of the loss (or `tolerance`, if that is larger) is predicted to go there. Fits "
+        "with a finite prior go on in double precision either way.",
     )
     warm_start: bool = Field(True, description="Start each integration from the solution of the one before.")
 
@@ -246,7 +247,10 @@ START_DEVIATION = 0.01
 class ForegroundPrior(Section):
     """Gaussian prior on deviations of the foregrounds from the assumed ones, flat over the modelled delays."""
 
-    mean: Literal["none", "sky-model"] = Field("none", description="What is assumed of the foregrounds.")
+    # Finite priors are fitted in double precision since 2.
+    mean: Literal["none", "sky-model"] = Field(
+        "none", description="What is assumed of the foregrounds.", json_schema_extra={REVISED: 2}
+    )
     deviation: Deviation = Field(
         "infinite",
         description="Standard deviation of what each baseline may have beside the mean, over the rms of the sky model; "

@@ -124,7 +124,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
     # Fits whose preconditioner is singular in single precision converge since 4.
-    version: ClassVar[int] = 4
+    # Directions that only the prior determines are fitted in double precision since 5.
+    version: ClassVar[int] = 5
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -138,7 +139,8 @@ class Unified(_LeastSquares, ForegroundFit):
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
     # Fits whose preconditioner is singular in single precision converge since 4.
-    version: ClassVar[int] = 4
+    # Directions that only the prior determines are fitted in double precision since 5.
+    version: ClassVar[int] = 5
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -151,7 +153,8 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
 
     # Only the last solve has the full tolerance since 2.
     # Fits whose preconditioner is singular in single precision converge since 3.
-    version: ClassVar[int] = 3
+    # Directions that only the prior determines are fitted in double precision since 4.
+    version: ClassVar[int] = 4
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"

@@ -8,7 +8,10 @@ without a finite prior, the couplings between antennas remain the strong ones, a
 used throughout.
 
 With a finite prior the damping is smaller. It then stays raised after a step that did not lower the loss, and falls
-again as steps achieve their predicted decrease.
+again as steps achieve their predicted decrease. Directions that foregrounds can nearly follow have a curvature from the
+prior alone. Products in single precision miss it by factors, so that steps along these directions are too short, and
+some hundred follow each other. Once single precision does not resolve the damping, such fits continue in double
+precision.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
 that are smaller. They matter where the noise is far below the foregrounds. Once the loss is so small that single
@@ -123,6 +126,17 @@ class GaussNewtonState:
         return kernels.dtype == tf.float32 and kernels.damping(self.history[-1]) <= kernels.dampings.least
 
     @property
+    def decided_by_prior(self) -> bool:
+        """Whether a finite prior determines directions that single precision does not resolve."""
+        return self.kernels.dampings.remembered and self.channel_steps == 0 and self.beyond_single
+
+    @property
+    def hides(self) -> bool:
+        """Whether the damping may hide directions that matter, so that convergence is checked with less of it."""
+        in_double = self.kernels.dampings.remembered and self.kernels.dtype == tf.float64
+        return self.beyond_single or (in_double and not self.curved)
+
+    @property
     def curved(self) -> bool:
         """Whether steps have their geodesic acceleration, and the damping stays raised."""
         return self.relief < 1
@@ -157,7 +171,8 @@ class GaussNewton:
     max_steps : maximum number of Gauss-Newton steps
     precision
         Precision of the inner products. Where single precision does not resolve the damping for the loss, ``double``
-        continues, and ``single`` is stalled if a larger decrease is possible.
+        continues, and ``single`` is stalled if a larger decrease is possible. Fits with a finite prior continue in
+        double precision either way, with ``single`` down to the damping that is tied to the loss.
     """
 
     tolerance: float = 1e-3
@@ -191,7 +206,7 @@ class GaussNewton:
         settled = self._settled(state)
         if self._goes_on(state) and (settled or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
-        if settled and state.beyond_single:
+        if settled and state.hides:
             return replace(state, predicted=self._checked(state).predicted, checked=True)
         kernels = state.kernels
         state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
@@ -230,7 +245,7 @@ class GaussNewton:
         if loss < self._rounding:
             return Solve("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if self._settled(state) and (state.checked or not (state.beyond_single or state.curved)):
+        if self._settled(state) and (state.checked or not (state.hides or state.curved)):
             return Solve("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.checked and self.precision == "single":
             return Solve(
@@ -337,6 +352,8 @@ class GaussNewton:
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Adapt the antenna blocks to the damping of the state, or compute them, and predict the next step."""
+        if self.precision == "single" and state.decided_by_prior:
+            state = _in_double(state, thorough=False)
         preconditioner = state.preconditioner
         kernels = state.kernels
         # Smooth gains couple all channels from the start.
