@@ -22,6 +22,7 @@ import numpy as np
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
+from calstudy.base.gains import known_gains
 
 if TYPE_CHECKING:
     import h5py
@@ -61,11 +62,9 @@ class GainTable:
         """Return gains by channel as a table of all antennas of the telescope, by ascending number."""
         order = np.argsort(cal.telescope.antenna_numbers)
         numbers = cal.telescope.antenna_numbers[order]
-        known = ~cal.flag_array & np.isfinite(cal.gain_array) & (cal.gain_array != 0)
-        values = np.where(known, cal.gain_array, 1)
-        values = np.where(known, 1 / values if cal.gain_convention == "multiply" else values, np.nan)
+        values, known = known_gains(cal)
         gains = np.full((len(numbers), *values.shape[1:]), np.nan, complex)
-        gains[np.searchsorted(numbers, cal.ant_array)] = values
+        gains[np.searchsorted(numbers, cal.ant_array)] = np.where(known, values, np.nan)
         single = cal.time_range is None
         return cls(
             gains,

@@ -174,23 +174,31 @@ def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
-    """Return the gains of the template's antennas, channels and polarizations.
+    """Return the gains of the antennas of the template's baselines, at its channels and polarizations.
 
     Raises InputError if `cal` has delays, or lacks an antenna, a channel or a polarization of the template.
 
     Returns
     -------
-    (Nants_telescope, Nfreqs, Ntimes of `cal`, Npols) complex128
-        In the order of `template.telescope.antenna_numbers` and in the convention "divide"; NaN where they are flagged,
-        and for antennas that are in no baseline of the template and not in `cal`.
+    (Nants, Nfreqs, Ntimes of `cal`, Npols) complex128
+        By ascending number of the antennas and in the convention "divide"; NaN where they are flagged.
     """
-    known = template.telescope.antenna_numbers
-    require_solutions(cal, np.unique(antenna_pairs(template)), template.freq_array, np.min(template.channel_width))
-    present = np.isin(known, cal.ant_array)
-    found, flags = solutions(cal, known[present], template.freq_array, template.polarization_array)
-    gains = np.full((len(known), *found.shape[1:]), np.nan, dtype=complex)
-    gains[present] = np.where(flags, np.nan, found)
-    return gains
+    numbers = np.unique(antenna_pairs(template))
+    require_solutions(cal, numbers, template.freq_array, np.min(template.channel_width))
+    gains, flags = solutions(cal, numbers, template.freq_array, template.polarization_array)
+    return np.where(flags, np.nan, gains)
+
+
+def known_gains(cal: UVCal) -> tuple[np.ndarray, np.ndarray]:
+    """Return gains in the convention "divide", one where there is no solution, and the mask of the solutions."""
+    known = ~cal.flag_array & np.isfinite(cal.gain_array) & (cal.gain_array != 0)
+    gains = np.where(known, cal.gain_array, 1)
+    return 1 / gains if cal.gain_convention == "multiply" else gains, known
+
+
+def solution_times(cal: UVCal) -> np.ndarray:
+    """Return the centres of the solutions in time, Julian dates, (Ntimes,)."""
+    return cal.time_array if cal.time_array is not None else cal.time_range.mean(axis=1)
 
 
 def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, width: float) -> None:
@@ -219,9 +227,8 @@ def solutions(
     for pol in polarizations:
         if pol not in cal.jones_array:
             raise InputError(f"gains: no solution for polarization {int(pol)} (AIPS number) of the data")
-    rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
+    rows, feeds = positions(cal.ant_array, numbers), positions(cal.jones_array, polarizations)
     channels = np.abs(cal.freq_array[None] - frequencies[:, None]).argmin(axis=1)
-    feeds = [int(np.flatnonzero(cal.jones_array == pol)[0]) for pol in polarizations]
     gains, flags = (array[rows][:, channels][..., feeds] for array in (cal.gain_array, cal.flag_array))
     if cal.gain_convention == "multiply":
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,6 +14,7 @@ import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.calibrate.degeneracy import align
+from calstudy.calibrate.problem import gain_products
 from calstudy.power.clusters import Clusters
 from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay
 
@@ -101,11 +102,6 @@ class Baselines:
         lobe = MAIN_LOBE / (channel_width(self.frequency) * self.frequency.size)
         return np.abs(self.delay) > horizon_delay(self.lengths[:, None]) + max(self.buffer, lobe)
 
-    def gain_products(self, gains: np.ndarray) -> np.ndarray:
-        """Return g_a g_b* of every baseline for gains (..., Nants, Nfreqs)."""
-        first, second = self.antennas.T
-        return gains[..., first, :] * gains[..., second, :].conj()
-
     def delay_power(self, spectra: np.ndarray) -> np.ndarray:
         """Return |V~|^2 averaged over integrations, (Nbls, Ndelays), of spectra (Ntimes, Nbls, Nfreqs)."""
         power = np.zeros(spectra.shape[1:])
@@ -176,8 +172,8 @@ def _models(truth: Truth, fit: Fit) -> dict[str, Statistic]:
 
 
 def _fitted_data(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
-    difference = truth.data - baselines.gain_products(fit.gains) * fit.model
-    noise = baselines.gain_products(truth.gains) * truth.noise
+    difference = truth.data - gain_products(fit.gains, baselines.antennas) * fit.model
+    noise = gain_products(truth.gains, baselines.antennas) * truth.noise
     ratio = np.sqrt(baselines.delay_power(difference).mean(axis=0) / baselines.delay_power(noise).mean(axis=0))
     error = _rms(difference, axis=(0, 2))
     return {
@@ -194,7 +190,7 @@ def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Stati
     used = outside.any(axis=1)
     if not used.any():
         return {}
-    true, fitted = baselines.gain_products(truth.gains), baselines.gain_products(fit.gains)
+    true, fitted = (gain_products(gains, baselines.antennas) for gains in (truth.gains, fit.gains))
     ratio = np.divide(true, fitted, out=np.ones_like(fitted), where=fitted != 0) - 1
     relative_noise = truth.noise / _rms(truth.foregrounds, axis=(0, 2))[:, None]
     power = [_masked_mean(baselines.delay_power(values), outside)[used] for values in (ratio, relative_noise)]

@@ -126,6 +126,12 @@ class ChannelGrid:
     n_channels: int
     positions: np.ndarray
 
+    def filled(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the channels, (..., Nfreqs), on the whole grid, complex, with zeros in the gaps."""
+        found = np.zeros((*values.shape[:-1], self.n_channels), np.result_type(values, np.complex64))
+        found[..., self.positions] = values
+        return found
+
 
 def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
     """Return the grid of channel centres (Nfreqs,) in Hz, ascending or descending, with or without gaps.

@@ -20,7 +20,7 @@ from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Frequency
 from calstudy.base.visibilities import channels_per_block
 from calstudy.calibrate.interface import Calibration
-from calstudy.calibrate.problem import gain_products
+from calstudy.calibrate.problem import gain_products, sum_by_antenna
 
 LEAST = 3
 """Smallest number of boards: baselines between two leave open how the gains of one compare with those of the other."""
@@ -99,18 +99,18 @@ class Boards(Section):
         assert found.flags is not None
         information = np.zeros(gains.shape)
         between = ~self.within(data)
-        first, second = data.antennas[between].T
+        antennas = data.antennas[between]
         for number, p in np.ndindex(gains.shape[2:]):
             times = groups[number]
-            products = gain_products(gains[..., number, p], data.antennas[between])
+            products = gain_products(gains[..., number, p], antennas)
             model = sky.visibilities[times][:, between, :, p]
             used = ~found.flags[times][:, between, :, p] & np.isfinite(products)
             residual = np.where(used, data.visibilities[times][:, between, :, p] / products - model, 0)
             freedom = used.sum() - np.isfinite(gains[..., number, p]).sum()
             power = np.sum(np.where(used, np.abs(model) ** 2, 0), axis=0)
             variance = np.sum(np.abs(residual) ** 2) / max(freedom, 1)
-            for ends in (first, second):
-                np.add.at(information[..., number, p], ends, 2 * power / max(variance, np.finfo(float).tiny))
+            each = 2 * power / max(variance, np.finfo(float).tiny)
+            information[..., number, p] = sum_by_antenna(each, antennas, len(gains))
         return information
 
     def _losses(self, gains: np.ndarray, information: np.ndarray, frame: Frame) -> np.ndarray:

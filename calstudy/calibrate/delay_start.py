@@ -124,9 +124,7 @@ class _DelayFit:
 
     def _power(self, spectra: np.ndarray) -> np.ndarray:
         """Compute |sum_nu x exp(-2 pi i nu tau)|^2 of some baselines at all delays, (Nspectra, Ndelays)."""
-        padded = np.zeros((len(spectra), self.grid.n_channels), complex)
-        padded[:, self.grid.positions] = spectra
-        return np.abs(fft(padded, self.n_delays, axis=1)) ** 2
+        return np.abs(fft(self.grid.filled(spectra), self.n_delays, axis=1)) ** 2
 
     def _fringe_scores(self, spectra: np.ndarray) -> np.ndarray:
         """Return the power of v m* by delay over the largest possible, minus its mean, (Nbls, Ndelays), float32."""

@@ -45,7 +45,7 @@ import numpy as np
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import pairs
 from calstudy.calibrate.basis import channel_grid
-from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.problem import CalibrationProblem, sum_by_antenna
 from calstudy.calibrate.solvers.preconditioners import DEGREE_FLOOR, Inverse, channel_inverse
 from calstudy.calibrate.solvers.reduced import FINITE, FREE, NormalEquations, compiled
 from calstudy.calibrate.tangent_space import TangentSpace
@@ -71,9 +71,7 @@ class DelayModes:
 
     def amplitudes(self, values: np.ndarray) -> np.ndarray:
         """Compute f* values for every delay: frequency is the last axis, (..., Nfreqs) to (..., Ndelays)."""
-        padded = np.zeros((*values.shape[:-1], self._grid.n_channels), complex)
-        padded[..., self._grid.positions] = values * self.weights
-        transformed = np.fft.ifft(padded, axis=-1, norm="forward")
+        transformed = np.fft.ifft(self._grid.filled(values * self.weights), axis=-1, norm="forward")
         return np.fft.fftshift(transformed, axes=-1)
 
 
@@ -206,12 +204,9 @@ def _jacobian(problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSp
     structure, shape = problem.structure, tangent.slope.shape
     n_antennas, n_frequencies = structure.n_antennas, structure.n_frequencies
     directions = np.eye(n_frequencies) if structure.gain_vectors is None else structure.gain_vectors
-    columns, power = [], np.abs(tangent.slope) ** 2
-    degrees = np.zeros((n_antennas, n_frequencies))
-    for column in structure.antennas.T:
-        np.add.at(degrees, column, power)
+    degrees = sum_by_antenna(np.abs(tangent.slope) ** 2, structure.antennas, n_antennas)
     degrees = np.maximum(degrees, DEGREE_FLOOR * degrees.mean())
-    diagonal = []
+    columns, diagonal = [], []
     for turn in (1, 1j):
         for antenna in range(n_antennas):
             relative = turn * directions / (1 if structure.gain_vectors is None else gains[antenna][:, None])

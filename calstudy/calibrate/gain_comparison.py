@@ -22,8 +22,10 @@ import numpy as np
 from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile
+from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile, known_gains, solution_times
+from calstudy.base.visibilities import positions
 from calstudy.calibrate.agreement import LIMITS, TAPER, aligned_gains
+from calstudy.calibrate.basis import ChannelGrid
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.gain_errors import determined_spans
 from calstudy.instrument.layouts import redundant_groups
@@ -127,12 +129,10 @@ def pair_gains(
     """Select the gains that two files have in common, and combine their errors.
 
     Gains may be of either convention. An integration of the first is compared with the closest of the second.
-    `polarization` is the index among the feeds that both have. Errors have the axes of the gains. Raises InputError if
-    a file holds delays, or if the two have no antennas, no such feed, or not the same channels in common.
+    `polarization` is the index among the feeds that both have. Errors have the axes of the gains. The files are from
+    `calstudy.base.gains.at_common_channels`. Raises InputError if the two have no antennas, no such feed, or not the
+    same channels in common.
     """
-    for name, cal in (("first", first), ("second", second)):
-        if cal.cal_type != "gain":
-            raise InputError(f"the {name} file holds solutions of type {cal.cal_type!r}; gains by channel are needed")
     numbers = np.intersect1d(first.ant_array, second.ant_array)
     feeds = [int(feed) for feed in first.jones_array if feed in second.jones_array]
     if not numbers.size:
@@ -143,7 +143,7 @@ def pair_gains(
     width = float(np.min(first.channel_width))
     if len(frequencies[0]) != len(frequencies[1]) or np.abs(np.subtract(*frequencies)).max() > SAME_CHANNEL * width:
         raise InputError("the two files do not have the same channels")
-    times = [cal.time_array if cal.time_array is not None else cal.time_range.mean(axis=1) for cal in (first, second)]
+    times = [solution_times(cal) for cal in (first, second)]
     closest = np.abs(times[1][None] - times[0][:, None]).argmin(axis=1)
     values, known = zip(*(_gains(cal, numbers, feeds[polarization]) for cal in (first, second)), strict=True)
     used = known[0] & known[1][closest]
@@ -155,9 +155,9 @@ def pair_gains(
         ]
         combined = np.where(used, np.hypot(parts[0], parts[1][:, closest]), np.nan)
     telescope = first.telescope
-    rows = [int(np.flatnonzero(telescope.antenna_numbers == number)[0]) for number in numbers]
+    rows = positions(telescope.antenna_numbers, numbers)
     return GainPair(
-        antennas=np.array([telescope.antenna_names[row] for row in rows]),
+        antennas=np.array(telescope.antenna_names)[rows],
         positions=telescope.get_enu_antpos()[rows, :2],
         frequency=frequencies[0],
         polarization={-5: "x", -6: "y", -1: "r", -2: "l"}.get(feeds[polarization], str(feeds[polarization])),
@@ -190,9 +190,10 @@ def _degrees_of_freedom(errors: Sequence[ErrorsOfFile]) -> float:
 
 def _of_feed(cal: UVCal, array: np.ndarray, numbers: np.ndarray, feed: int) -> np.ndarray:
     """Return (Ntimes, Nants, Nfreqs), channels ascending, of an array with the axes of the gains."""
-    rows = [int(np.flatnonzero(cal.ant_array == number)[0]) for number in numbers]
     column = int(np.flatnonzero(cal.jones_array == feed)[0])
-    return np.moveaxis(array[rows][..., column][:, np.argsort(np.ravel(cal.freq_array))], 2, 0)
+    return np.moveaxis(
+        array[positions(cal.ant_array, numbers)][..., column][:, np.argsort(np.ravel(cal.freq_array))], 2, 0
+    )
 
 
 def _relative_errors(cal: UVCal, errors: ErrorsOfFile, numbers: np.ndarray, feed: int) -> np.ndarray:
@@ -205,10 +206,8 @@ def _relative_errors(cal: UVCal, errors: ErrorsOfFile, numbers: np.ndarray, feed
 
 def _gains(cal: UVCal, numbers: np.ndarray, feed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return gains and the mask of valid ones, (Ntimes, Nants, Nfreqs), channels ascending."""
-    gains, flags = (_of_feed(cal, array, numbers, feed) for array in (cal.gain_array, cal.flag_array))
-    known = ~flags & np.isfinite(gains) & (gains != 0)
-    values = np.where(known, gains, 1)
-    return np.where(known, 1 / values if cal.gain_convention == "multiply" else values, 0), known
+    gains, known = (_of_feed(cal, array, numbers, feed) for array in known_gains(cal))
+    return np.where(known, gains, 0), known
 
 
 def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
@@ -229,9 +228,10 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
     aligned = np.zeros_like(first)
     aligned[solved] = aligned_gains(first[solved], pair.second[solved])
     difference = aligned - pair.second
-    grid, place = _even_grid(pair.frequency)
+    grid = _even_grid(pair.frequency)
+    frequencies = np.linspace(pair.frequency[0], pair.frequency[-1], grid.n_channels)
     power = [
-        np.mean(np.abs(delay_transform(_with_gaps(values, place, grid.size), grid, TAPER)) ** 2, axis=(0, 1))
+        np.mean(np.abs(delay_transform(grid.filled(values), frequencies, TAPER)) ** 2, axis=(0, 1))
         for values in (difference, pair.second)
     ]
     return GainDifference(
@@ -239,14 +239,14 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         as_given=float(_relative(pair.first - pair.second, pair.second, (0, 1, 2))),
         of_antenna=_relative(difference, pair.second, (0, 2)),
         of_channel=_relative(difference, pair.second, (0, 1)),
-        delay=delays(grid.size, channel_width(grid)),
+        delay=delays(grid.n_channels, channel_width(frequencies)),
         of_delay=np.sqrt(power[0] / power[1]),
         pulls=None if pair.errors is None else _pulls(replace(pair, first=aligned), pair.errors),
     )
 
 
-def _even_grid(frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return evenly spaced channels that contain the given ones, and the place of each; raises InputError if none do.
+def _even_grid(frequency: np.ndarray) -> ChannelGrid:
+    """Return the grid of evenly spaced channels that contain the given ones; raises InputError if none do.
 
     Files that lack channels have gaps, and so have the channels that two files have in common.
     """
@@ -259,14 +259,7 @@ def _even_grid(frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(
             "the common channels of the two files do not lie on an evenly spaced grid; average or select them"
         )
-    return np.linspace(frequency[0], frequency[-1], place[-1] + 1), place
-
-
-def _with_gaps(values: np.ndarray, place: np.ndarray, size: int) -> np.ndarray:
-    """Return gains with zeros in the channels that are lacking."""
-    found = np.zeros((*values.shape[:-1], size), values.dtype)
-    found[..., place] = values
-    return found
+    return ChannelGrid(float(width), int(place[-1]) + 1, place)
 
 
 def _pulls(pair: GainPair, errors: np.ndarray) -> np.ndarray | None:

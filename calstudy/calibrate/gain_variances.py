@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calstudy.calibrate.problem import CalibrationProblem
+from calstudy.calibrate.problem import CalibrationProblem, sum_by_antenna
 from calstudy.calibrate.tangent_space import TangentSpace
 
 RESOLVED = 1e-9
@@ -109,9 +109,8 @@ def by_antenna(
     `known` is the diagonal for known foregrounds, of `by_channel`.
     """
     shape = alignment.of_channel.shape
-    degrees, alone, with_scale = np.zeros(shape), np.zeros((2, *shape)), np.zeros(shape)
-    for ends in antennas.T:
-        np.add.at(degrees, ends, np.abs(tangent.slope) ** 2)
+    degrees = sum_by_antenna(np.abs(tangent.slope) ** 2, antennas, len(spans))
+    alone, with_scale = np.zeros((2, *shape)), np.zeros(shape)
     for antenna, block in enumerate(_blocks(tangent, antennas, degrees, spans)):
         if block.size:
             scaled, scale = _scaled(block)

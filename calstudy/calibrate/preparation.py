@@ -11,7 +11,7 @@ from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
-from calstudy.base.gains import gains_for
+from calstudy.base.gains import gains_for, solution_times
 from calstudy.base.observation import Observation
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
@@ -206,12 +206,8 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
     """
     if gains is None:
         return np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
-    values = gains_for(gains, data.uvd)
-    rows = {int(number): row for row, number in enumerate(data.uvd.telescope.antenna_numbers)}
-    values = values[[rows[int(number)] for number in data.numbers]]
-    centres = gains.time_array if gains.time_array is not None else np.mean(gains.time_range, axis=1)
-    closest = np.abs(centres[None] - data.times[:, None]).argmin(axis=1)
-    values = values[:, :, closest]
+    closest = np.abs(solution_times(gains)[None] - data.times[:, None]).argmin(axis=1)
+    values = gains_for(gains, data.uvd)[:, :, closest]
     return np.where(np.isfinite(values) & (values != 0), values, 1)
 
 

@@ -226,10 +226,7 @@ class CalibrationProblem:
     @property
     def antenna_weights(self) -> np.ndarray:
         """Summed weights of the baselines of each antenna, shape (Nants, Nfreqs)."""
-        total = np.zeros((self.structure.n_antennas, self.structure.n_frequencies))
-        for column in self.structure.antennas.T:
-            np.add.at(total, column, self.weights)
-        return total
+        return sum_by_antenna(self.weights, self.structure.antennas, self.structure.n_antennas)
 
     @property
     def prior_target(self) -> complex:
@@ -295,8 +292,17 @@ def weight_change(weights: np.ndarray, before: np.ndarray) -> float:
 
 
 def gain_products(gains: np.ndarray, antennas: np.ndarray) -> np.ndarray:
-    """Return g_a g_b* of each baseline, shape (Nbls, Nfreqs), from gains (Nants, Nfreqs) and antennas (Nbls, 2)."""
-    return gains[antennas[:, 0]] * gains[antennas[:, 1]].conj()
+    """Return g_a g_b* of baselines, (..., Nbls, Nfreqs), from gains (..., Nants, Nfreqs) and antennas (Nbls, 2)."""
+    first, second = antennas.T
+    return gains[..., first, :] * gains[..., second, :].conj()
+
+
+def sum_by_antenna(values: np.ndarray, antennas: np.ndarray, n_antennas: int) -> np.ndarray:
+    """Return the sums of real values, (Nbls, Nfreqs), over the baselines of each antenna, (Nants, Nfreqs)."""
+    total = np.zeros((n_antennas, values.shape[1]))
+    for ends in antennas.T:
+        np.add.at(total, ends, values)
+    return total
 
 
 def make_structure(frame: Frame, settings: GainFit, band: slice = WHOLE_BAND) -> FitStructure:

@@ -11,7 +11,7 @@ import numpy as np
 from calstudy.base.errors import InputError
 from calstudy.base.files import json_number
 from calstudy.base.gains import make_uvcal
-from calstudy.base.visibilities import from_cube
+from calstudy.base.visibilities import from_cube, positions
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
@@ -174,8 +174,7 @@ def make_gains(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.n
     `numbers` are the antenna numbers of the rows, (Nants,). Gains and flags are (Nants, Nfreqs, Ntimes, Npols).
     """
     known = data.telescope.antenna_numbers
-    rows = {int(number): row for row, number in enumerate(known)}
-    places = [rows[int(number)] for number in numbers]
+    places = positions(known, numbers)
     everywhere = np.ones((len(known), *gains.shape[1:]), complex)
     nowhere = np.ones(everywhere.shape, bool)
     everywhere[places], nowhere[places] = gains, flags

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from calstudy.calibrate.agreement import Baselines, Fit, Truth, as_json, compare_with_truth, from_json
 from calstudy.calibrate.degeneracy import align
+from calstudy.calibrate.problem import gain_products
 
 FREQUENCY = 167e6 + 80e3 * np.arange(384)
 ENU = 30.0 * np.array([[0, 0], [1, 0], [0, 1], [2, 1], [1, 3], [3, 0]])
@@ -38,14 +39,14 @@ def truth(request) -> Truth:
     horizon = LENGTHS / 299792458.0
     foregrounds = np.stack([10 * smooth(rng, len(PAIRS), 0.8 * horizon) for _ in range(N_TIMES)])
     noise = 0.01 * complex_normal(rng, *foregrounds.shape)
-    return Truth(gains, foregrounds, noise, BASELINES.gain_products(gains) * (foregrounds + noise))
+    return Truth(gains, foregrounds, noise, gain_products(gains, BASELINES.antennas) * (foregrounds + noise))
 
 
 def fit(truth: Truth, gains: np.ndarray | None = None, model: np.ndarray | None = None) -> Fit:
     """A fit with R = V / (g g*) - F for the given gains (Ntimes, Nants, Nfreqs) and model, the true ones by default."""
     gains = truth.gains if gains is None else gains
     model = truth.foregrounds if model is None else model
-    return Fit(gains, model, truth.data / BASELINES.gain_products(gains) - model)
+    return Fit(gains, model, truth.data / gain_products(gains, BASELINES.antennas) - model)
 
 
 def values(truth: Truth, found: Fit) -> dict[str, float]:
@@ -122,7 +123,7 @@ def test_gaps_do_not_change_what_is_measured(truth):
     gaps = Truth(known * truth.gains, used * truth.foregrounds, used * truth.noise, used * truth.data)
     rng = np.random.default_rng(44)
     gains = known * truth.gains * (1 + 0.05 * complex_normal(rng, *truth.gains.shape))
-    products = BASELINES.gain_products(gains)
+    products = gain_products(gains, BASELINES.antennas)
     residual = np.divide(gaps.data, products, out=np.zeros_like(gaps.data), where=used) - gaps.foregrounds
     found = values(gaps, Fit(gains, gaps.foregrounds, residual))
     assert np.isfinite(list(found.values())).all()
@@ -137,7 +138,7 @@ def test_gains_that_stay_as_they_were_at_first_are_charged_with_the_drift():
     foregrounds, noise = complex_normal(rng, 2, N_TIMES, len(PAIRS), FREQUENCY.size)
     turns = np.exp(0.1j * np.arange(N_TIMES)[:, None] * (-1.0) ** np.arange(len(ENU)))
     gains = turns[..., None] * np.ones(FREQUENCY.size)
-    drifting = Truth(gains, foregrounds, noise, BASELINES.gain_products(gains) * (foregrounds + noise))
+    drifting = Truth(gains, foregrounds, noise, gain_products(gains, BASELINES.antennas) * (foregrounds + noise))
     constant = Fit(np.ones_like(gains), foregrounds, noise)
     # Every antenna is 0.1 t off the common phase, and the best real scale is cos(0.1 t).
     expected = np.abs(np.cos(0.1 * np.arange(N_TIMES)) - np.exp(0.1j * np.arange(N_TIMES)))
@@ -148,7 +149,7 @@ def test_smooth_errors_common_to_gains_and_model_cancel_in_the_product(truth):
     """The paper's degeneracy: 10 % errors of gains and model, none of their product."""
     rng = np.random.default_rng(45)
     error = 1 + 0.1 * smooth(rng, len(ENU), np.full(len(ENU), 30e-9)).real
-    model = truth.foregrounds / BASELINES.gain_products(error)
+    model = truth.foregrounds / gain_products(error, BASELINES.antennas)
     found = values(truth, fit(truth, truth.gains * error, model))
     assert 0.05 < found["gains_aligned"] < 0.15
     assert 0.05 < found["model_aligned"] < 0.3

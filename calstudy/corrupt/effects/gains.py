@@ -24,7 +24,6 @@ from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import gains_for
 from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Fraction, Frequency, Time
-from calstudy.base.visibilities import antenna_rows
 from calstudy.corrupt.drift import Antennas, Polynomial, Shape, is_named, refusal_of_antennas
 from calstudy.corrupt.interface import GainEffect
 
@@ -190,9 +189,7 @@ class FileGains(GainEffect):
         has another number of times.
         """
         del random
-        template = observation.uvd
-        cal = read_gains(self.path, "corruption.effects: path", template)
-        values = gains_for(cal, template)[antenna_rows(template)]
+        values = gains_for(read_gains(self.path, "corruption.effects: path", observation.uvd), observation.uvd)
         if values.shape[2] not in (1, observation.n_times):
             raise InputError(
                 f"corruption.effects: path = {str(self.path)!r}: holds gains for {values.shape[2]} times; it must hold "
