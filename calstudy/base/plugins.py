@@ -74,6 +74,11 @@ class Plugin(Section):
         """Whether the plug-in is one of calstudy's own."""
         return type(self).__module__.startswith(f"{self.registry.package}.")
 
+    def is_about_field(self, sentence: str) -> bool:
+        """Return whether a sentence starts with the path of a setting and a colon."""
+        field, colon, _ = sentence.partition(":")
+        return bool(colon) and field.split(".")[0] in type(self).model_fields
+
     def __reduce__(self) -> tuple:
         """Pickle by reference: a class from a file cannot be imported by name in another process."""
         return _revive, (self.registry.base_path, self.model_dump(mode="json"))

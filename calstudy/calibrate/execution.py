@@ -167,8 +167,7 @@ def require_calibratable(calibrator: Calibrator, frame: Frame, has_sky_model: bo
     with guarded(calibrator):
         reason = calibrator.refusal(frame, has_sky_model)
     if reason is not None:
-        field, colon, _ = reason.partition(":")
-        about_field = colon and field.split(".")[0] in type(calibrator).model_fields
+        about_field = calibrator.is_about_field(reason)
         raise InputError(f"calibration.{reason}" if about_field else f"{_where(calibrator)}: {reason}")
 
 

@@ -154,14 +154,10 @@ class FitTensors:
         return model if self.model_index is None else tf.gather(model, self.model_index, axis=1)
 
     def sum_over_group(self, values: tf.Tensor) -> tf.Tensor:
-        """Add up the baselines of each model, the transpose of `to_baselines`; first axis (Nbls,) to (Nmodels,)."""
-        return values if self.model_index is None else tf.math.segment_sum(values, self.model_index)
-
-    def sum_pairs_over_group(self, values: tf.Tensor) -> tf.Tensor:
-        """Apply `sum_over_group` to values of shape (2, Nbls, Nfreqs)."""
+        """Add up the baselines of each model, (2, Nbls, Nfreqs) to (2, Nmodels, Nfreqs); transposes `to_baselines`."""
         if self.model_index is None:
             return values
-        return tf.stack([self.sum_over_group(part) for part in tf.unstack(values)])
+        return tf.stack([tf.math.segment_sum(part, self.model_index) for part in tf.unstack(values)])
 
 
 # From this many visibilities on, the elementwise products of a fit are compiled (XLA): one pass over the memory in

@@ -16,6 +16,7 @@ from pydantic import Field
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.schema import Section, choice
 from calstudy.base.units import Delay, Frequency, Phase, Time
+from calstudy.instrument.as_built import Antennas
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation
@@ -84,9 +85,6 @@ def _symmetric_root(covariance: np.ndarray) -> np.ndarray:
 
 
 Shape = Annotated[Polynomial | Delays | Correlated, choice("kind", "polynomial")]
-
-
-Antennas = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
 Channels = Annotated[Literal["common", "independent"] | Polynomial | Delays | Correlated, choice("kind", "polynomial")]
 
 

@@ -157,11 +157,9 @@ def require_usable(effects: Sequence[Effect], size: Size) -> None:
     for place, effect in enumerate(effects):
         with guarded(effect):
             reason = effect.refusal(size)
-        if reason is None:
-            continue
-        field, colon, _ = reason.partition(":")
-        about_field = colon and field.split(".")[0] in type(effect).model_fields
-        raise InputError(f"corruption.effects.{place}{'.' if about_field else f' = {effect.label!r}: '}{reason}")
+        if reason is not None:
+            named = "." if effect.is_about_field(reason) else f" = {effect.label!r}: "
+            raise InputError(f"corruption.effects.{place}{named}{reason}")
 
 
 def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:

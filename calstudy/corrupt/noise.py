@@ -26,17 +26,14 @@ class SystemTemperature(Section):
     )
     sky_index: float = Field(-2.6, ge=-5, le=1, description="Spectral index of the temperature of the sky.")
 
-    def kelvin(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return the system temperature, K, (Nfreqs,), at channel centres in Hz."""
-        return self.receiver + self.sky * (frequencies / self.sky_frequency) ** self.sky_index
-
     def autocorrelations(self, frequencies: np.ndarray, effective_area: float | np.ndarray) -> np.ndarray:
         """Return V_aa = k T / A_e in Jy, (Nfreqs,), in the convention V_xx = 1/2 int A I of the simulation.
 
         Frequencies are channel centres, Hz, (Nfreqs,); the effective area of an antenna is in m2, a number or
         (Nfreqs,).
         """
-        return BOLTZMANN * self.kelvin(frequencies) / effective_area / WATTS_PER_JANSKY
+        kelvin = self.receiver + self.sky * (frequencies / self.sky_frequency) ** self.sky_index
+        return BOLTZMANN * kelvin / effective_area / WATTS_PER_JANSKY
 
 
 class Autocorrelations(SystemTemperature):

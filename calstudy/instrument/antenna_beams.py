@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from pyuvdata import UVBeam, UVData
@@ -23,8 +22,6 @@ from calstudy.instrument.beams import make_beam
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams, Beam, model_of
 from calstudy.instrument.settings import AssignedBeam, InstrumentSettings, assigned_beams, nominal_beams
 from calstudy.instrument.tabulated import describe, tabulate
-
-Source = TypeVar("Source")
 
 
 def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | AntennaBeams:
@@ -60,7 +57,7 @@ def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[An
     return [made[key] if error == nominal else MisalignedBeam(shared[key], error) for key, error in found]
 
 
-def split_beams(beam: Source | AntennaBeams, template: UVData) -> tuple[tuple[Source | AntennaBeam, ...], np.ndarray]:
+def split_beams(beam: AntennaBeam | AntennaBeams, template: UVData) -> tuple[tuple[AntennaBeam, ...], np.ndarray]:
     """Return the distinct beams of an array, and the index of the beam of each antenna, (Nants,) int."""
     if isinstance(beam, AntennaBeams):
         return beam.beams, beam.index

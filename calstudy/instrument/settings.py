@@ -12,7 +12,7 @@ from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
-from calstudy.instrument.as_built import AsBuilt, BeamErrors, Misalignment, dipole_amplitudes, misalignments
+from calstudy.instrument.as_built import Antennas, AsBuilt, BeamErrors, Misalignment, dipole_amplitudes, misalignments
 
 # Longest observation, s.
 LONGEST = 86_400.0
@@ -52,7 +52,7 @@ Beam = Annotated[SerializeAsAny[Plugin], BEAMS.field(DEFAULT_BEAM)]
 class AntennaBeam(Section):
     """Antennas with a beam other than `instrument.beam`."""
 
-    antennas: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)] = Field(
+    antennas: Annotated[Antennas, Field(min_length=1)] = Field(
         description="Antennas, counted from 0 in the order of the layout."
     )
     beam: Beam = Field(description="Their beam; the kinds are those of `instrument.beam`.")

@@ -18,10 +18,10 @@ import numpy as np
 
 from calstudy.base.visibilities import subset_template
 from calstudy.instrument.antenna_beams import make_beams
-from calstudy.instrument.interface import AntennaBeams, model_of
+from calstudy.instrument.interface import AntennaBeam, AntennaBeams, model_of
 from calstudy.instrument.telescope import make_template
 from calstudy.power.cosmology import make_cosmology
-from calstudy.simulate.interface import BeamSource, Engine, simulate_with
+from calstudy.simulate.interface import Engine, simulate_with
 from calstudy.simulate.nodes import Accuracy, Axis, frequency_axis, frequency_blocks, integration_times, time_axis
 from calstudy.simulate.sources import sky_cells
 from calstudy.sky.eor import EorField
@@ -115,7 +115,7 @@ def plan_chunks(template: UVData, accuracy: Accuracy, count: int) -> list[Chunk]
 
 
 def simulate_chunk(
-    engine: Engine, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, chunk: Chunk
+    engine: Engine, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, chunk: Chunk
 ) -> np.ndarray:
     """Simulate a chunk in Jy at all integrations and at its frequency nodes, (Ntimes, Nbls, Nf, Npols) complex128.
 
@@ -143,7 +143,7 @@ def assemble(chunks: list[Chunk], cubes: Iterable[np.ndarray]) -> np.ndarray:
 def simulate_visibilities(
     engine: Engine,
     sky: SkyModel,
-    beam: BeamSource | AntennaBeams,
+    beam: AntennaBeam | AntennaBeams,
     template: UVData,
     accuracy: Accuracy,
     count: int = 1,

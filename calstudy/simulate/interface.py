@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -17,17 +17,9 @@ from calstudy.simulate.nodes import EXACT, Accuracy, integration_times, time_axi
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
-    from pyuvdata import UVBeam, UVData
-    from pyuvdata.analytic_beam import AnalyticBeam
+    from pyuvdata import UVData
 
-    from calstudy.instrument.interface import AntennaBeams
-
-
-class BeamSource(Protocol):
-    """A beam that is available at any frequency, as returned by `calstudy.instrument.beams.make_beam`."""
-
-    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
-        """Return the E-field beam, tabulated at these frequencies (Hz) or in closed form."""
+    from calstudy.instrument.interface import AntennaBeam, AntennaBeams
 
 
 @dataclass(frozen=True)
@@ -71,7 +63,7 @@ class Engine(Plugin, ABC):
 
     kind: str = Field("", description="Name of an engine, or a file.py.")
 
-    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does.
 
         The arguments are those of `simulate`. By default every simulation is supported.
@@ -80,7 +72,7 @@ class Engine(Plugin, ABC):
         return None
 
     @abstractmethod
-    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
 
         It is called only with arguments that `refusal` accepts.
@@ -101,7 +93,7 @@ class Engine(Plugin, ABC):
         """
 
     def interpolate(
-        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+        self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy
     ) -> np.ndarray:
         """Simulate as `simulate` does, but only to the given accuracy.
 
@@ -133,7 +125,7 @@ class Engine(Plugin, ABC):
 def simulate_with(
     engine: Engine,
     sky: SkyModel,
-    beam: BeamSource | AntennaBeams,
+    beam: AntennaBeam | AntennaBeams,
     template: UVData,
     accuracy: Accuracy = EXACT,
 ) -> np.ndarray:

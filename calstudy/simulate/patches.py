@@ -33,8 +33,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, require_rectangular
 from calstudy.instrument.antenna_beams import split_beams
-from calstudy.instrument.interface import AntennaBeams
-from calstudy.simulate.interface import BeamSource
+from calstudy.instrument.interface import AntennaBeam, AntennaBeams
 from calstudy.simulate.nodes import (
     SINGLE_PRECISION,
     Accuracy,
@@ -63,7 +62,7 @@ LEAST, LOOSEST = 1e-30, 0.5
 
 
 def visibilities(
-    sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy, dtype: type | None = None
+    sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy, dtype: type | None = None
 ) -> np.ndarray:
     """Simulate an unpolarized sky, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 
@@ -134,7 +133,7 @@ def polarization_feeds(template: UVData) -> list[str]:
 class PatchedArray:
     """The antennas and beams of an observation, and the times and frequencies at which patches are simulated."""
 
-    def __init__(self, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy) -> None:
+    def __init__(self, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy) -> None:
         require_rectangular(template)
         self.template, self.accuracy = template, accuracy
         used, pairs = np.unique(antenna_indices(template), return_inverse=True)

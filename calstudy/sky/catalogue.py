@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +50,7 @@ class Catalogue:
 
     def select(self, chosen: np.ndarray) -> Catalogue:
         """Return the sources selected by a boolean or index array."""
-        return Catalogue(
-            self.names[chosen],
-            self.right_ascension[chosen],
-            self.declination[chosen],
-            self.flux[chosen],
-            self.spectral_index[chosen],
-        )
+        return Catalogue(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
@@ -75,8 +69,8 @@ def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
 
 def concatenate(*catalogues: Catalogue) -> Catalogue:
     """Join several catalogues."""
-    fields = ("names", "right_ascension", "declination", "flux", "spectral_index")
-    return Catalogue(*(np.concatenate([getattr(part, field) for part in catalogues]) for field in fields))
+    names = [field.name for field in fields(Catalogue)]
+    return Catalogue(*(np.concatenate([getattr(part, name) for part in catalogues]) for name in names))
 
 
 def read_gleam_table(path: Path) -> Catalogue:

@@ -141,7 +141,7 @@ class JointLoss:
         # The sum runs over visibilities as they were measured, also where the solver turned a baseline around.
         orientation = self._tensors.orientation
         of_parts = tf.stack([weights, weights if orientation is None else weights * orientation])
-        return self.coefficients(self._tensors.sum_pairs_over_group(of_parts))
+        return self.coefficients(self._tensors.sum_over_group(of_parts))
 
     def coefficients(self, models: tf.Tensor) -> tuple[tf.Tensor, ...]:
         """Return A^T F of each bucket for models (2, Nmodels, Nfreqs), float64; the transpose of `foreground_model`."""

@@ -42,6 +42,7 @@ from calstudy.calibrate.solvers.reduced import (
     MOST_DAMPING,
     ROUNDING_LOSS,
     ROUNDING_LOSS_IN_DOUBLE,
+    ReducedData,
     ReducedKernels,
     compiled,
     newton_decrement_at,
@@ -82,8 +83,7 @@ class GaussNewtonState:
 
     Attributes
     ----------
-    scale : unit of the visibilities, their weighted rms
-    data : visibilities, weights whose sum is one, and the model if it is frozen
+    reduced : the data, and the gains that the iteration started from
     channel_steps
         Number of accepted steps until the antenna blocks are made: zero near a minimum, as at a warm start or a check
         of convergence.
@@ -99,9 +99,7 @@ class GaussNewtonState:
     """
 
     kernels: ReducedKernels
-    scale: float
-    data: tuple[tf.Tensor, ...]
-    loss_unit: float
+    reduced: ReducedData
     gains: tf.Tensor
     projection: Projection
     history: tuple[float, ...]
@@ -190,9 +188,7 @@ class GaussNewton:
         projection = kernels.project(reduced.gains, *reduced.data)
         state = GaussNewtonState(
             kernels,
-            reduced.scale,
-            reduced.data,
-            reduced.loss_unit,
+            reduced,
             reduced.gains,
             projection,
             (float(projection.loss),),
@@ -212,7 +208,7 @@ class GaussNewton:
         state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
         relative = tf.cast(step.eta, tf.float64)
         gains = pairs.multiply(state.gains, pairs.exponential(relative) if state.curved else _one_plus(relative))
-        trial = kernels.project(gains, *state.data)
+        trial = kernels.project(gains, *state.reduced.data)
         loss = float(trial.loss)
         # This also refuses a loss that is not a number, and a missing step, from blocks that are singular in float32.
         if not loss < state.history[-1]:
@@ -322,11 +318,11 @@ class GaussNewton:
 
     def losses(self, state: GaussNewtonState) -> Sequence[float]:
         """Return the loss history in the unit of the data squared."""
-        return [loss * state.loss_unit for loss in state.history]
+        return [loss * state.reduced.loss_unit for loss in state.history]
 
     def estimate(self, state: GaussNewtonState) -> tuple[np.ndarray, np.ndarray]:
         """Return the current gains and their best-fitting foregrounds."""
-        model = state.kernels.tensors.unload(state.projection.model, state.scale)
+        model = state.kernels.tensors.unload(state.projection.model, state.reduced.scale)
         return pairs.to_complex(state.gains), model
 
     def newton_decrement(self, state: GaussNewtonState, problem: CalibrationProblem) -> float:
@@ -403,5 +399,5 @@ def _next_boost(boost: float, gain: float) -> float:
 def _in_double(state: GaussNewtonState, thorough: bool) -> GaussNewtonState:
     """Return a state whose products are made in double precision."""
     kernels = state.kernels.in_double(thorough)
-    projection = kernels.project(state.gains, *state.data)
+    projection = kernels.project(state.gains, *state.reduced.data)
     return replace(state, kernels=kernels, projection=projection, channel_steps=0, preconditioner=None)

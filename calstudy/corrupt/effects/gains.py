@@ -24,8 +24,9 @@ from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import gains_for
 from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Fraction, Frequency, Time
-from calstudy.corrupt.drift import Antennas, Polynomial, Shape, is_named, refusal_of_antennas
+from calstudy.corrupt.drift import Polynomial, Shape, is_named, refusal_of_antennas
 from calstudy.corrupt.interface import GainEffect
+from calstudy.instrument.as_built import Antennas
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Observation

@@ -10,8 +10,9 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.units import Fraction, Frequency
 from calstudy.base.visibilities import channels_per_block
-from calstudy.corrupt.drift import Antennas, refusal_of_antennas
+from calstudy.corrupt.drift import refusal_of_antennas
 from calstudy.corrupt.interface import Effect, Truth
+from calstudy.instrument.as_built import Antennas
 
 if TYPE_CHECKING:
     from calstudy.base.observation import Frame, Observation

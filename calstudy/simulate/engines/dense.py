@@ -11,14 +11,14 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
 from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
-from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
+from calstudy.simulate.interface import Engine, SimulationSize
 from calstudy.simulate.nodes import EXACT, SINGLE_PRECISION, Accuracy
 
 if TYPE_CHECKING:
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
-    from calstudy.instrument.interface import AntennaBeams
+    from calstudy.instrument.interface import AntennaBeam, AntennaBeams
 
 
 class DenseEngine(Engine):
@@ -35,7 +35,7 @@ class DenseEngine(Engine):
         "where the tolerance of the interpolation is 1e-5 or more.",
     )
 
-    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
         from calstudy.instrument.antenna_beams import split_beams
         from calstudy.simulate import patterns
@@ -52,12 +52,12 @@ class DenseEngine(Engine):
         reasons = (patterns.refusal(item.at(template.freq_array[:1]), feeds) for item in beams)
         return next((reason for reason in reasons if reason), None)
 
-    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
         return self.interpolate(sky, beam, template, EXACT)
 
     def interpolate(
-        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+        self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy
     ) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.interpolate`."""
         from calstudy.simulate.patches import visibilities
@@ -95,7 +95,7 @@ class FastestEngine(Engine):
         precise = {} if self.precision == "auto" else {"precision": self.precision}
         return [DenseEngine(**precise), MatvisEngine(**precise), FftvisEngine(**precise), PyuvsimEngine()]
 
-    def choose(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> Engine:
+    def choose(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> Engine:
         """Return the fastest engine that supports a simulation, or raise InputError with the reasons of all engines."""
         reasons = []
         for engine in self.engines():
@@ -107,7 +107,7 @@ class FastestEngine(Engine):
             reasons.append(f"{engine.label}: {reason}")
         raise InputError("no engine handles this simulation; " + "; ".join(reasons))
 
-    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reasons why no engine supports a simulation, or None if one does."""
         try:
             self.choose(sky, beam, template)
@@ -115,12 +115,12 @@ class FastestEngine(Engine):
             return str(error)
         return None
 
-    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities of the fastest engine that supports the simulation; see `Engine.simulate`."""
         return self.choose(sky, beam, template).simulate(sky, beam, template)
 
     def interpolate(
-        self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData, accuracy: Accuracy
+        self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy
     ) -> np.ndarray:
         """Return the visibilities of the fastest engine to a tolerance; see `Engine.interpolate`."""
         return self.choose(sky, beam, template).interpolate(sky, beam, template, accuracy)

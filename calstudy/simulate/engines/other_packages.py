@@ -17,8 +17,8 @@ from pydantic import Field
 
 from calstudy.base.resources import Cost
 from calstudy.base.visibilities import antenna_indices, require_rectangular, use_bundled_earth_orientation
-from calstudy.instrument.interface import AntennaBeams
-from calstudy.simulate.interface import BeamSource, Engine, SimulationSize
+from calstudy.instrument.interface import AntennaBeam, AntennaBeams
+from calstudy.simulate.interface import Engine, SimulationSize
 from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
@@ -43,11 +43,11 @@ class MatvisEngine(Engine):
         description="Of all arithmetic, fringe phases included: single agrees with pyuvsim to 1e-4 of the rms.",
     )
 
-    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
         return refusal("matvis", sky, beam, template)
 
-    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
         from matvis.wrapper import simulate_vis
 
@@ -78,7 +78,7 @@ def missing_package(engine: str) -> str | None:
     return None
 
 
-def refusal(engine: str, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+def refusal(engine: str, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
     """Return the reason why matvis or fftvis does not support a simulation, or None if it does."""
     from calstudy.instrument.antenna_beams import split_beams
     from calstudy.simulate.sources import is_polarized
@@ -97,7 +97,7 @@ def refusal(engine: str, sky: SkyModel, beam: BeamSource | AntennaBeams, templat
 
 
 def call(
-    sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData
+    sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData
 ) -> tuple[dict[str, Any], list[UVBeam | BeamInterface], np.ndarray]:
     """Return keyword arguments of `simulate_vis`, the distinct beams, and the antennas of each baseline, (Nbls, 2).
 
@@ -184,13 +184,13 @@ class FftvisEngine(Engine):
         description="Accuracy of the transforms, 1e-12 or 1e-6; the arithmetic is double in both.",
     )
 
-    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
         if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
             return "fftvis confuses the feeds of cross-hand polarizations if antennas have different beams"
         return refusal("fftvis", sky, beam, template)
 
-    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
         from fftvis.wrapper import simulate_vis
 
@@ -225,7 +225,7 @@ class PyuvsimEngine(Engine):
     kind: str = "pyuvsim"
     precision: Literal["double"] = Field("double", description="pyuvsim has no other.")
 
-    def refusal(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> str | None:
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
         from calstudy.instrument.antenna_beams import split_beams
 
@@ -237,7 +237,7 @@ class PyuvsimEngine(Engine):
                 return f"the beam's feeds do not give polarization number {missing[0]}"
         return None
 
-    def simulate(self, sky: SkyModel, beam: BeamSource | AntennaBeams, template: UVData) -> np.ndarray:
+    def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
         from calstudy.instrument.antenna_beams import split_beams
 
