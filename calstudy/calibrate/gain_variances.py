@@ -193,14 +193,8 @@ class Absorbed(NamedTuple):
 
     def columns(self, span: np.ndarray) -> np.ndarray:
         """Return J^T q, then J^T i q, within a span (Nfreqs, N): real parts above imaginary ones, (2 N, 2 Nvec)."""
-        along, against = (None if part is None else _within(span, part) for part in (self.along, self.against))
-        if along is not None and against is not None:
-            both = np.concatenate([along + against, 1j * (along - against)], axis=1)
-        elif along is not None:
-            both = np.concatenate([along, 1j * along], axis=1)
-        else:
-            assert against is not None
-            both = np.concatenate([against, -1j * against], axis=1)
+        along, against = (0 if part is None else _within(span, part) for part in (self.along, self.against))
+        both = np.concatenate([along + against, 1j * (along - against)], axis=1)
         return np.concatenate([both.real, both.imag])
 
 

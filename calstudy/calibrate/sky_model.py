@@ -91,16 +91,14 @@ def match_sky_model(sky: UVData, data: UVData) -> UVData:
     Raises InputError if baselines, integrations, channels or polarizations of the data are missing from the sky model.
     """
     sky = sky.copy()
-    wanted = set(np.unique(data.baseline_array).tolist())
-    reverse = np.array(
-        [data.antnums_to_baseline(int(b), int(a)) for a, b in zip(sky.ant_1_array, sky.ant_2_array, strict=True)]
-    )
-    turned = np.flatnonzero(~np.isin(sky.baseline_array, list(wanted)) & np.isin(reverse, list(wanted)))
+    wanted = np.unique(data.baseline_array)
+    reverse = data.antnums_to_baseline(sky.ant_2_array, sky.ant_1_array)
+    turned = np.flatnonzero(~np.isin(sky.baseline_array, wanted) & np.isin(reverse, wanted))
     if turned.size:
         sky.conjugate_bls(turned)
-    missing = wanted - set(sky.baseline_array.tolist())
-    if missing:
-        a, b = data.baseline_to_antnums(min(missing))
+    missing = np.setdiff1d(wanted, sky.baseline_array)
+    if missing.size:
+        a, b = data.baseline_to_antnums(int(missing[0]))
         raise InputError(f"sky model: lacks {len(missing)} baseline(s) of the data, such as ({a}, {b})")
     times = [_closest(sky.time_array, time, 1e-6) for time in np.unique(data.time_array)]
     if None in times:
@@ -111,7 +109,7 @@ def match_sky_model(sky: UVData, data: UVData) -> UVData:
         raise InputError("sky model: lacks channels of the data")
     if not np.isin(data.polarization_array, sky.polarization_array).all():
         raise InputError(f"sky model: has polarizations {', '.join(sky.get_pols())}, data {', '.join(data.get_pols())}")
-    rows = np.isin(sky.baseline_array, list(wanted)) & np.isin(sky.time_array, sky.time_array[times])
+    rows = np.isin(sky.baseline_array, wanted) & np.isin(sky.time_array, sky.time_array[times])
     sky.select(blt_inds=np.flatnonzero(rows), freq_chans=channels, polarizations=data.polarization_array)
     sky.reorder_pols(order=np.argsort(sky.polarization_array)[_ranks(data.polarization_array)], run_check=False)
     sky.reorder_blts(order="time", minor_order="baseline", run_check=False)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pyuvdata import UVFlag
+from pyuvdata import UVData, UVFlag
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
@@ -108,14 +108,8 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
         raise InputError(f"{where}: weights must be finite and not negative")
     if file.Nfreqs != data.n_channels or not np.allclose(file.freq_array, data.frequencies, rtol=1e-9, atol=0):
         raise InputError(f"{where}: the channels of the weights are not those of the data")
-    rows = {
-        (int(baseline), round(float(time) / TIME_TOLERANCE)): row
-        for row, (baseline, time) in enumerate(zip(file.baseline_array, file.time_array, strict=True))
-    }
-    wanted = [
-        (int(baseline), round(float(time) / TIME_TOLERANCE))
-        for baseline, time in zip(data.uvd.baseline_array, data.uvd.time_array, strict=True)
-    ]
+    rows = {key: row for row, key in enumerate(_keys(file))}
+    wanted = _keys(data.uvd)
     if any(key not in rows for key in wanted):
         raise InputError(f"{where}: no weights for some baselines or integrations of the data")
     hands = [np.flatnonzero(file.polarization_array == pol) for pol in data.polarizations]
@@ -123,6 +117,12 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
         raise InputError(f"{where}: no weights for some polarizations of the data")
     found = values[[rows[key] for key in wanted]][:, :, np.concatenate(hands)]
     return found.astype(float).reshape(data.shape)
+
+
+def _keys(file: UVData | UVFlag) -> list[tuple[int, int]]:
+    """Return baseline and time, in units of the tolerance, of each row of a file."""
+    times = np.round(file.time_array / TIME_TOLERANCE).astype(int)
+    return list(zip(file.baseline_array.tolist(), times.tolist(), strict=True))
 
 
 def _read_uvflag(path: Path, where: str) -> UVFlag:

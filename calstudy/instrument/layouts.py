@@ -266,42 +266,34 @@ def _redundant_groups(content: bytes, tolerance: float) -> RedundantGroups:
     return RedundantGroups(index, conjugated)
 
 
-@dataclass(frozen=True)
-class _Extent:
-    """Number of antennas, longest and mean baseline (m)."""
-
-    antennas: int
-    longest: float
-    mean: float
-
-
-def _extent(layout: Plugin) -> _Extent:
+def _extent(layout: Plugin) -> tuple[int, float, float]:
+    """Return the number of antennas, and the longest and the mean baseline (m)."""
     return _extent_of(layout, digest_json(identity(layout)))
 
 
 @lru_cache(maxsize=256)
-def _extent_of(layout: Plugin, content: str) -> _Extent:
+def _extent_of(layout: Plugin, content: str) -> tuple[int, float, float]:
     """Return the extent of a layout; `content` is a digest that changes with its files."""
     del content
     enu = make_layout(layout).enu
     first, second = np.triu_indices(len(enu), 1)
     lengths = np.linalg.norm(enu[first] - enu[second], axis=1)
-    return _Extent(len(enu), float(lengths.max()), float(lengths.mean()))
+    return len(enu), float(lengths.max()), float(lengths.mean())
 
 
 def size_of_instrument(instrument: InstrumentSettings) -> Size:
     """Return the size of an instrument's data."""
-    extent = _extent(instrument.layout)
+    antennas, longest, mean = _extent(instrument.layout)
     return Size(
-        antennas=extent.antennas,
+        antennas=antennas,
         times=instrument.times.count,
         channels=instrument.channels,
         polarizations=len(instrument.polarizations),
-        longest=extent.longest,
-        mean=extent.mean,
+        longest=longest,
+        mean=mean,
     )
 
 
 def antenna_count(layout: Plugin) -> int:
     """Return the number of antennas of a layout. Raises InputError as `make_layout`."""
-    return _extent(layout).antennas
+    return _extent(layout)[0]

@@ -12,7 +12,7 @@ from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
-from calstudy.instrument.as_built import Antennas, AsBuilt, BeamErrors, Misalignment, dipole_amplitudes, misalignments
+from calstudy.instrument.as_built import Antennas, AsBuilt, Misalignment, dipole_amplitudes, misalignments
 
 # Longest observation, s.
 LONGEST = 86_400.0
@@ -220,9 +220,6 @@ def nominal_beams(settings: InstrumentSettings) -> list[Plugin]:
 
 def beam_count(settings: InstrumentSettings, count: int) -> int:
     """Return the number of distinct beams of `count` antennas as built; errors are those of `assigned_beams`."""
-    built = settings.as_built
-    if not (settings.antenna_beams or built.dipoles.differ or built.beams != BeamErrors()):
-        return 1
     return len(set(assigned_beams(settings, count)))
 
 
@@ -231,11 +228,9 @@ def assigned_beams(settings: InstrumentSettings, count: int) -> list[AssignedBea
     distinct, index = nominal_beams(settings), np.zeros(count, dtype=int)
     for group in settings.antenna_beams.values():
         index[list(group.antennas)] = distinct.index(group.beam)
-    dipoles = settings.as_built.dipoles
-    amplitudes = dipole_amplitudes(dipoles, count) if dipoles.differ else np.ones((count, 0, 0))
+    built = settings.as_built
+    amplitudes, errors = dipole_amplitudes(built.dipoles, count), misalignments(built.beams, count)
     return [
         AssignedBeam(int(model), None if (weights == 1).all() else tuple(map(tuple, weights.tolist())), misalignment)
-        for model, weights, misalignment in zip(
-            index, amplitudes, misalignments(settings.as_built.beams, count), strict=True
-        )
+        for model, weights, misalignment in zip(index, amplitudes, errors, strict=True)
     ]

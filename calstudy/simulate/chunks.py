@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -78,22 +78,6 @@ class Chunk:
         return sky.select(component_inds=chosen, inplace=False, run_check=False) if len(chosen) else None
 
 
-@dataclass(frozen=True)
-class InterpolationCheck:
-    """Comparison of interpolated with directly simulated visibilities where the error should be largest.
-
-    Both errors are relative to the rms of the visibilities. They are of all combinations of `times_jd` (Julian dates)
-    and `frequencies` (Hz).
-    """
-
-    max_error: float
-    rms_error: float
-    times_jd: list[float]
-    frequencies: list[float]
-    time_nodes: int
-    frequency_nodes: int
-
-
 def plan_chunks(template: UVData, accuracy: Accuracy, count: int) -> list[Chunk]:
     """Split a simulation into at most `count` chunks that take about equal times.
 
@@ -160,8 +144,11 @@ def check_interpolation(
     chunk: Chunk,
     channels: slice = slice(None),
     count: int = 3,
-) -> InterpolationCheck:
-    """Compare interpolated visibilities with a direct simulation at a few integrations and channels.
+) -> dict[str, Any]:
+    """Compare interpolated visibilities with a direct simulation where the error should be largest.
+
+    Errors, the largest and the rms, are relative to the rms of the visibilities, and of all combinations of a few
+    integrations (Julian dates) and channels (Hz). They are returned with the numbers of nodes, as plain JSON types.
 
     Parameters
     ----------
@@ -181,14 +168,14 @@ def check_interpolation(
     direct = simulate(subset_template(template, times[at_times], frequencies[at_channels]))
     errors = np.abs(cube[at_times][:, :, at_channels] - direct)
     rms = np.sqrt(np.mean(np.abs(direct) ** 2))
-    return InterpolationCheck(
-        max_error=float(errors.max() / rms),
-        rms_error=float(np.sqrt(np.mean(errors**2)) / rms),
-        times_jd=times[at_times].tolist(),
-        frequencies=frequencies[at_channels].tolist(),
-        time_nodes=len(nodes),
-        frequency_nodes=len(chunk.axis.nodes),
-    )
+    return {
+        "max_error": float(errors.max() / rms),
+        "rms_error": float(np.sqrt(np.mean(errors**2)) / rms),
+        "times_jd": times[at_times].tolist(),
+        "frequencies": frequencies[at_channels].tolist(),
+        "time_nodes": len(nodes),
+        "frequency_nodes": len(chunk.axis.nodes),
+    }
 
 
 def _farthest(samples: np.ndarray, nodes: np.ndarray, candidates: np.ndarray, count: int) -> np.ndarray:
@@ -272,6 +259,4 @@ class Component:
         channels = slice(-CHECKED, None) if self.is_eor else slice(None)
         sky = self.sky(np.arange(self.template.Nfreqs)[channels])
         simulate = partial(simulate_with, self.engine, sky, self.beam)
-        return asdict(
-            check_interpolation(simulate, self.as_built, cube, self.chunks[0], channels=channels, count=CHECKED)
-        )
+        return check_interpolation(simulate, self.as_built, cube, self.chunks[0], channels, CHECKED)
