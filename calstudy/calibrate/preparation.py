@@ -196,6 +196,8 @@ def _require_finite(data: Observation) -> None:
 
 # hera_cal wants a name for the polarization; solves are one polarization at a time.
 POL = "nn"
+Key = tuple[int, int, str]
+"""A baseline and a polarization, as in hera_cal."""
 
 
 def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
@@ -230,8 +232,7 @@ def redundant_start(
     by less than `tolerance`, in m, are redundant. Gains are unity for antennas without redundant baselines, and where
     the solution is not finite. Raises InputError if no two baselines are redundant.
     """
-    pairs, cube = data.pairs, data.visibilities
-    groups = redundant_groups(data.vectors, tolerance)
+    pairs, groups = data.pairs, redundant_groups(data.vectors, tolerance)
     members = [np.flatnonzero(groups.index == group) for group in range(groups.index.max() + 1)]
     members = [rows for rows in members if rows.size > 1 and pairs[rows[0], 0] != pairs[rows[0], 1]]
     if not members:
@@ -239,23 +240,18 @@ def redundant_start(
             "calibration.initial_gains: 'redundant' needs redundant baselines, and no two differ by less than "
             f"redundancy_tolerance = {tolerance:g} m; start from unity or a file"
         )
-    turned = {row: groups.conjugated[row] for rows in members for row in rows}
-    ends = {row: pairs[row][::-1] if back else pairs[row] for row, back in turned.items()}
+    ends = {row: pairs[row][::-1] if groups.conjugated[row] else pairs[row] for rows in members for row in rows}
     keys = {row: (int(first), int(second), POL) for row, (first, second) in ends.items()}
     reds = [[keys[row] for row in rows] for rows in members]
     gains = np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
     for p in range(data.n_polarizations):
         used = {keys[row]: weights[:, row, :, p] for row in keys}
+        measured = _turned(data.visibilities[..., p], keys, groups.conjugated)
         # The logarithm must not be taken of zeros, even where the weight is zero.
-        visibilities = {
-            keys[row]: np.where(used[keys[row]] > 0, np.conj(cube[:, row, :, p]) if back else cube[:, row, :, p], 1)
-            for row, back in turned.items()
-        }
+        visibilities = {key: np.where(used[key] > 0, values, 1) for key, values in measured.items()}
         solved = _solve(reds, visibilities, used, data.frequencies, settings.delays)
         if sky is not None:
-            model = {
-                keys[row]: np.conj(sky[:, row, :, p]) if back else sky[:, row, :, p] for row, back in turned.items()
-            }
+            model = _turned(sky[..., p], keys, groups.conjugated)
             overlap = {
                 key: used[key] * values * np.nan_to_num(model[key]).conj() for key, values in visibilities.items()
             }
@@ -266,10 +262,15 @@ def redundant_start(
     return np.where(np.isfinite(gains) & (gains != 0), gains, 1)
 
 
+def _turned(cube: np.ndarray, keys: dict[int, Key], conjugated: np.ndarray) -> dict[Key, np.ndarray]:
+    """Return the rows (Ntimes, Nfreqs) of a cube (Ntimes, Nbls, Nfreqs) by key, conjugated where they must be."""
+    return {key: np.conj(cube[:, row]) if conjugated[row] else cube[:, row] for row, key in keys.items()}
+
+
 def _solve(
-    reds: list[list[tuple[int, int, str]]],
-    visibilities: dict[tuple[int, int, str], np.ndarray],
-    weights: dict[tuple[int, int, str], np.ndarray],
+    reds: list[list[Key]],
+    visibilities: dict[Key, np.ndarray],
+    weights: dict[Key, np.ndarray],
     frequency: np.ndarray,
     delays: bool,
 ) -> dict[int, np.ndarray]:
@@ -291,8 +292,8 @@ def _solve(
 
 
 def _along_sky(
-    reds: list[list[tuple[int, int, str]]],
-    overlap: dict[tuple[int, int, str], np.ndarray],
+    reds: list[list[Key]],
+    overlap: dict[Key, np.ndarray],
     gains: dict[int, np.ndarray],
 ) -> dict[int, np.ndarray]:
     """Return gains with the phase gradient of the sky model; `overlap` are weighted data times its conjugate."""
@@ -309,7 +310,7 @@ def _along_sky(
     return {antenna: gain * known.get(antenna, 1) for antenna, gain in gains.items()}
 
 
-def _product(gains: dict[tuple[int, str], np.ndarray], key: tuple[int, int, str], like: np.ndarray) -> np.ndarray:
+def _product(gains: dict[tuple[int, str], np.ndarray], key: Key, like: np.ndarray) -> np.ndarray:
     """Return g_a g_b* of a baseline; unity if there are no gains."""
     from hera_cal.utils import split_bl
 

@@ -30,7 +30,7 @@ class EorField:
 
     The flat spectrum is one independent normal number per pixel and channel with variance σ²(ν) = P / V(ν), where V is
     the comoving volume of the voxel (paper §Simulations; Mpc without h). A power law, a table or a box is correlated
-    between channels; see `channel_covariance`.
+    between channels; see `covariance_factor`.
 
     The field is not smoothed over the channel (P is white up to the Nyquist wavenumber of the channel spacing) nor over
     the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power law). A delay spectrum
@@ -123,10 +123,11 @@ class EorField:
             harmonics[:, orders] = root @ normal[0] + 1j * (root @ normal[1])
         return harmonics
 
-    def channel_covariance(self, ell: int) -> np.ndarray:
-        """Return C_ℓ(ν, ν') of a spectrum that is not flat in K² sr, (Nfreqs, Nfreqs).
+    def covariance_factor(self, ell: float) -> np.ndarray:
+        """Return F with C_ℓ(ν, ν') = F Fᵀ, in K² sr, of a spectrum that is not flat, (Nfreqs, 2 Nnodes).
 
-        In the flat-sky limit, with the line of sight in units of channels (κ = k_∥ Δr(ν), |κ| < π),
+        It has a cosine and a sine wave per quadrature node. In the flat-sky limit, with the line of sight in units of
+        channels (κ = k_∥ Δr(ν), |κ| < π),
 
             C_ℓ(ν_n, ν_m) = 1 / (r_n r_m √(Δr_n Δr_m)) ∫ dκ/2π cos(κ (n − m)) √(P(k_n) P(k_m)),
             k_n² = (κ/Δr_n)² + ((ℓ + ½)/r_n)².
@@ -135,8 +136,13 @@ class EorField:
         channels it is the geometric mean, which keeps the matrix positive definite. P ∝ k⁰ gives the white spectrum
         P / (r² Δr) of the flat field exactly.
         """
-        factor = self._spectral_factor(ell)
-        return factor @ factor.T
+        phase, weight = _phase_quadrature(len(self.frequencies))
+        wavenumber = np.hypot(phase / self.depth[:, None], (ell + 0.5) / self.distance[:, None])
+        band = float(self.frequencies[0]), float(self.frequencies[-1])
+        power = input_power(self.settings, wavenumber, self._hubble, band)
+        amplitude = np.sqrt(power * weight) / (self.distance * np.sqrt(self.depth))[:, None]
+        turns = np.arange(len(self.frequencies))[:, None] * phase
+        return np.concatenate([amplitude * np.cos(turns), amplitude * np.sin(turns)], axis=1)
 
     def covariance_roots(self, lmax: int) -> CubicSpline:
         """Return triangular L(log(ℓ + ½)) with L Lᵀ = C_ℓ to 3e-5 of its largest element.
@@ -145,17 +151,7 @@ class EorField:
         triangular root with a positive diagonal is unique, and therefore as smooth in ℓ as the covariance.
         """
         nodes = np.linspace(np.log(0.5), np.log(lmax + 0.5), ROOT_NODES)
-        return CubicSpline(nodes, [_triangular_root(self._spectral_factor(np.exp(node) - 0.5)) for node in nodes])
-
-    def _spectral_factor(self, ell: float) -> np.ndarray:
-        """Return F, (Nfreqs, 2 Nnodes), with C_ℓ = F Fᵀ: a cosine and a sine wave per quadrature node."""
-        phase, weight = _phase_quadrature(len(self.frequencies))
-        wavenumber = np.hypot(phase / self.depth[:, None], (ell + 0.5) / self.distance[:, None])
-        band = float(self.frequencies[0]), float(self.frequencies[-1])
-        power = input_power(self.settings, wavenumber, self._hubble, band)
-        amplitude = np.sqrt(power * weight) / (self.distance * np.sqrt(self.depth))[:, None]
-        turns = np.arange(len(self.frequencies))[:, None] * phase
-        return np.concatenate([amplitude * np.cos(turns), amplitude * np.sin(turns)], axis=1)
+        return CubicSpline(nodes, [_triangular_root(self.covariance_factor(np.exp(node) - 0.5)) for node in nodes])
 
 
 def input_power(settings: Eor, k: np.ndarray, hubble: float, band: tuple[float, float] | None = None) -> np.ndarray:

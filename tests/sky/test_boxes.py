@@ -175,7 +175,8 @@ def test_a_sky_is_drawn_as_from_a_table_of_the_power_of_the_box(tmp_path):
         for name, file in (("box", path), ("table", table))
     )
     for ell in (5, 700):
-        np.testing.assert_allclose(boxed.channel_covariance(ell), tabled.channel_covariance(ell), rtol=1e-9)
+        factors = boxed.covariance_factor(ell), tabled.covariance_factor(ell)
+        np.testing.assert_allclose(*(factor @ factor.T for factor in factors), rtol=1e-9)
     np.testing.assert_allclose(boxed.maps(slice(0, 2)), tabled.maps(slice(0, 2)), rtol=1e-4, atol=1e-9)
 
 
