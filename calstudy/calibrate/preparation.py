@@ -240,9 +240,9 @@ def redundant_start(
             "calibration.initial_gains: 'redundant' needs redundant baselines, and no two differ by less than "
             f"redundancy_tolerance = {tolerance:g} m; start from unity or a file"
         )
-    ends = {row: pairs[row][::-1] if groups.conjugated[row] else pairs[row] for rows in members for row in rows}
-    keys = {row: (int(first), int(second), POL) for row, (first, second) in ends.items()}
-    reds = [[keys[row] for row in rows] for rows in members]
+    ends = np.where(groups.conjugated[:, None], pairs[:, ::-1], pairs).tolist()
+    keys = {row: (ends[row][0], ends[row][1], POL) for rows in members for row in rows.tolist()}
+    reds = [[keys[row] for row in rows.tolist()] for rows in members]
     gains = np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
     for p in range(data.n_polarizations):
         used = {keys[row]: weights[:, row, :, p] for row in keys}

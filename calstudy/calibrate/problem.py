@@ -326,7 +326,7 @@ def make_structure(frame: Frame, settings: GainFit, band: slice = WHOLE_BAND) ->
 
 def _foregrounds(frame: Frame, settings: ForegroundFit, band: slice) -> FitStructure:
     prior = settings.foreground_prior
-    if not settings.grouped:
+    if prior.shared_deviation == 0:
         basis = make_basis(frame.lengths, frame.frequencies, settings.basis, prior.finite, band)
         structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
         return replace(structure, prior="own") if prior.finite else structure

@@ -424,8 +424,3 @@ class ForegroundFit(GainFit):
     def estimates_deviation(self) -> bool:
         """Whether a deviation of the foregrounds' prior is estimated from the data."""
         return self.foreground_prior.estimated
-
-    @property
-    def grouped(self) -> bool:
-        """Whether redundant baselines have foregrounds in common."""
-        return self.foreground_prior.shared_deviation != 0

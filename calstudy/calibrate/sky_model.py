@@ -9,7 +9,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.visibilities import from_cube, to_cube
+from calstudy.base.visibilities import from_cube, positions, to_cube
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -111,7 +111,7 @@ def match_sky_model(sky: UVData, data: UVData) -> UVData:
         raise InputError(f"sky model: has polarizations {', '.join(sky.get_pols())}, data {', '.join(data.get_pols())}")
     rows = np.isin(sky.baseline_array, wanted) & np.isin(sky.time_array, sky.time_array[times])
     sky.select(blt_inds=np.flatnonzero(rows), freq_chans=channels, polarizations=data.polarization_array)
-    sky.reorder_pols(order=np.argsort(sky.polarization_array)[_ranks(data.polarization_array)], run_check=False)
+    sky.reorder_pols(order=positions(sky.polarization_array, data.polarization_array), run_check=False)
     sky.reorder_blts(order="time", minor_order="baseline", run_check=False)
     return sky
 
@@ -119,7 +119,3 @@ def match_sky_model(sky: UVData, data: UVData) -> UVData:
 def _closest(values: np.ndarray, wanted: float, tolerance: float) -> int | None:
     index = int(np.abs(values - wanted).argmin())
     return index if abs(values[index] - wanted) <= tolerance else None
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    return np.argsort(np.argsort(values))

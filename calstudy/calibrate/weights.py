@@ -16,6 +16,7 @@ from pyuvdata import UVData, UVFlag
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.observation import Observation
+from calstudy.base.visibilities import positions
 from calstudy.calibrate.settings import NOISE_UNKNOWN, FileWeights, ForegroundFit, Weights
 
 # Times of weights and data agree within this, in days.
@@ -83,17 +84,16 @@ def inverse_variances(
 
 def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:
     """Return nsamples / (V_aa V_bb), zero where either is flagged or not positive."""
-    antennas = data.pairs
-    autos = {int(a): row for row, (a, b) in enumerate(antennas) if a == b}
-    missing = sorted(set(antennas[fitted].ravel().tolist()) - set(autos))
-    if missing:
+    antennas, autos = data.antennas[fitted], np.flatnonzero(data.autos)
+    missing = data.numbers[np.setdiff1d(antennas, data.antennas[autos])]
+    if missing.size:
         raise InputError(
             "weights: 'autos' needs autocorrelations, which the data lack for antenna(s) "
             f"{', '.join(map(str, missing))}"
         )
     power = np.where(data.flags, 0, np.nan_to_num(data.visibilities.real))
     inverse = np.where(power > 0, 1 / np.where(power > 0, power, 1), 0)
-    first, second = (np.array([autos[int(a)] for a in column]) for column in antennas[fitted].T)
+    first, second = autos[positions(data.antennas[autos, 0], antennas)].T
     return inverse[:, first] * inverse[:, second] * data.nsamples[:, fitted]
 
 

@@ -91,12 +91,6 @@ def solve_warm(
     not an error; after a failed solve there is no warm start. With `warm` of None the solve starts from the problem's
     initial gains.
     """
-    solution, state = _solve(problem, solver, warm)
-    return solution, WarmStart(solution.gains, solver.memory(state)) if solution.record.usable else None
-
-
-def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) -> tuple[Solution, Any]:
-    """Return the solution and the solver's last state."""
     started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)
     while (ended := solver.terminate(state)) is None:
@@ -126,7 +120,7 @@ def _solve(problem: CalibrationProblem, solver: Solver, warm: WarmStart | None) 
         decrement_rms=rms,
     )
     logger.debug("%s after %d steps, %.2f s: %s", record.status, record.steps, record.seconds, record.message)
-    return Solution(gains, model, record), state
+    return Solution(gains, model, record), WarmStart(gains, solver.memory(state)) if record.usable else None
 
 
 def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> str | None:
@@ -161,7 +155,7 @@ def decrement_rms(gains: np.ndarray, model: np.ndarray, problem: CalibrationProb
 
 def solve(problem: CalibrationProblem, solver: Solver) -> Solution:
     """Solve one problem from its initial gains (see `solve_warm`)."""
-    return _solve(problem, solver, None)[0]
+    return solve_warm(problem, solver)[0]
 
 
 class Checkpoint(NamedTuple):
