@@ -46,10 +46,6 @@ class Autocorrelations(SystemTemperature):
         "mwa-*.",
     )
 
-    def jansky(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return the autocorrelations, Jy, (Nfreqs,), at channel centres in Hz."""
-        return self.autocorrelations(frequencies, self.effective_area)
-
 
 def effective_area(frequencies: np.ndarray, omega_p: np.ndarray) -> np.ndarray:
     """Return A_e = lambda^2 / Omega_p of a beam without losses, m2, from Hz and the solid angle of its power, sr."""

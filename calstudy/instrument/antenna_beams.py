@@ -69,7 +69,7 @@ MARGIN = 12
 
 
 class NominalBeam:
-    """The nominal beam of antennas that are misaligned, each in its own way (`AntennaBeam`).
+    """The nominal beam of antennas that are misaligned, each in its own way.
 
     It keeps the splines of the table at the frequencies that were requested last, if `keep` is true: that is worth the
     memory if several antennas have the beam.
@@ -80,10 +80,6 @@ class NominalBeam:
         self._beam, self._keep = beam, keep
         self._kept: tuple[np.ndarray, UVBeam, np.ndarray] | None = None
 
-    def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
-        """Return the E-field beam at `frequencies` (Hz, (Nfreqs,))."""
-        return self._beam.at(frequencies)
-
     def splined(self, frequencies: np.ndarray) -> tuple[UVBeam | AnalyticBeam, np.ndarray]:
         """Return the E-field beam, and the coefficients of `_spline_table`, which are empty for a beam in closed form.
 
@@ -91,7 +87,7 @@ class NominalBeam:
         """
         if self._kept is not None and np.array_equal(self._kept[0], frequencies):
             return self._kept[1:]
-        beam = self.at(frequencies)
+        beam = self._beam.at(frequencies)
         if not isinstance(beam, UVBeam):
             return beam, np.empty(0)
         splines = _splines_of(beam)
@@ -107,7 +103,7 @@ class MisalignedBeam:
     nominal beam is at the zenith. If several antennas have the nominal beam, it should be a `NominalBeam`.
     """
 
-    def __init__(self, beam: AntennaBeam, misalignment: Misalignment) -> None:
+    def __init__(self, beam: AntennaBeam | NominalBeam, misalignment: Misalignment) -> None:
         self.name, self.stand_in = beam.name, beam.stand_in
         self._beam = beam if isinstance(beam, NominalBeam) else NominalBeam(beam, keep=False)
         self._misalignment = misalignment

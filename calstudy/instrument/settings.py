@@ -8,14 +8,12 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
 from calstudy.instrument.as_built import Antennas, AsBuilt, Misalignment, dipole_amplitudes, misalignments
-
-# Longest observation, s.
-LONGEST = 86_400.0
 
 
 class Site(Section):
@@ -83,7 +81,7 @@ class Times(Section):
     @model_validator(mode="after")
     def _end_within_a_day(self) -> Times:
         duration = self.integration * self.count
-        if duration > LONGEST:
+        if duration > SECONDS_PER_DAY:
             raise fault(
                 "",
                 f"{self.count} integrations of {self.integration:g} s are {duration / 3600:.4g} h; a day is the most",

@@ -19,7 +19,7 @@ from pydantic import Field
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.gain_files import read_h5parm
 from calstudy.base.observation import Frame
-from calstudy.base.resources import LIBRARIES_MEMORY, Cost
+from calstudy.base.resources import COMPLEX64, LIBRARIES_MEMORY, Cost
 from calstudy.base.units import Frequency
 from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage, Solved
 from calstudy.calibrate.interface import Solve
@@ -34,7 +34,6 @@ COMMANDS = ("DP3", "DP3.py")
 TELESCOPE = "array"
 INTERVAL = 2.0
 """Seconds between the integrations of the measurement set; DDECal does not use them."""
-COMPLEX64 = 8
 CORRELATIONS = 4
 
 

@@ -120,7 +120,8 @@ class MutualCoupling(Effect):
         coefficients = truth["modulus"] * np.exp(1j * (truth["phase"] + 2 * np.pi * turns))
         pairs = np.zeros((observation.n_channels, count, count), complex)
         if self.autos is not None:
-            pairs[:, range(count), range(count)] = self.autos.jansky(observation.frequencies)[:, None]
+            own = self.autos.autocorrelations(observation.frequencies, self.autos.effective_area)
+            pairs[:, range(count), range(count)] = own[:, None]
         for integration in visibilities:
             for polarization in np.moveaxis(integration, -1, 0):
                 pairs[:, first, second], pairs[:, second, first] = polarization.T, polarization.T.conj()
