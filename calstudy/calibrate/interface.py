@@ -120,11 +120,6 @@ class Smoothing(Section):
         "as the calibrator leaves them.",
     )
 
-    @property
-    def over_time(self) -> bool:
-        """Whether integrations are smoothed together."""
-        raise NotImplementedError
-
 
 class DpssSmoothing(Smoothing):
     """Least-squares fit of discrete prolate spheroidal sequences in frequency and in time."""
@@ -145,7 +140,7 @@ class DpssSmoothing(Smoothing):
 
     @property
     def over_time(self) -> bool:
-        """Whether there is a time scale."""
+        """Whether integrations are smoothed together."""
         return self.time_scale is not None
 
 
@@ -164,7 +159,7 @@ class PolynomialSmoothing(Smoothing):
 
     @property
     def over_time(self) -> bool:
-        """Whether there is a degree in time."""
+        """Whether integrations are smoothed together."""
         return self.time_degree is not None
 
 

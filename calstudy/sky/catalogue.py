@@ -142,8 +142,6 @@ def _tilt(sky: SkyModel, change: np.ndarray) -> None:
 
 def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:
     """Return the sources as point components, with spectra according to the settings."""
-    stokes = np.zeros((4, 1, len(catalogue))) * units.Jy
-    stokes[0, 0] = catalogue.flux * units.Jy
     spectrum: dict[str, Any] = {"spectral_type": "flat"}
     if settings.spectrum == "catalogue":
         spectrum = {
@@ -151,9 +149,17 @@ def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:
             "spectral_index": catalogue.spectral_index,
             "reference_frequency": np.full(len(catalogue), FREQUENCY) * units.Hz,
         }
+    directions = SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs")
+    return _points(catalogue.names, directions, catalogue.flux, spectrum)
+
+
+def _points(names: np.ndarray, directions: SkyCoord, flux: np.ndarray, spectrum: dict[str, Any]) -> SkyModel:
+    """Return unpolarized points with fluxes in Jy, and other arguments of a sky model for their spectra."""
+    stokes = np.zeros((4, 1, len(flux))) * units.Jy
+    stokes[0, 0] = flux * units.Jy
     return SkyModel(
-        name=catalogue.names.astype(str),
-        skycoord=SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs"),
+        name=names.astype(str),
+        skycoord=directions,
         stokes=stokes,
         component_type="point",
         history="calstudy foregrounds",
@@ -178,8 +184,6 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     }
     usable = np.isfinite([values[key] for key in ("right_ascension", "declination", "flux")]).all(axis=0)
     values = {key: column[usable] for key, column in values.items()}
-    stokes = np.zeros((4, 1, int(usable.sum()))) * units.Jy
-    stokes[0, 0] = values["flux"] * units.Jy
     spectrum: dict[str, Any] = {"spectral_type": "flat"}
     if "spectral_index" in values:
         if (lacking := ~np.isfinite(values["spectral_index"])).any():
@@ -189,15 +193,9 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
                 "leave out csv.spectral_index"
             )
         spectrum = {"spectral_type": "spectral_index", "spectral_index": values["spectral_index"]}
-    return SkyModel(
-        name=np.flatnonzero(usable).astype(str),
-        skycoord=SkyCoord(values["right_ascension"], values["declination"], unit="deg", frame="icrs"),
-        stokes=stokes,
-        reference_frequency=np.full(stokes.shape[2], columns.frequency) * units.Hz,
-        component_type="point",
-        history="calstudy foregrounds",
-        **spectrum,
-    )
+    spectrum["reference_frequency"] = np.full(len(values["flux"]), columns.frequency) * units.Hz
+    directions = SkyCoord(values["right_ascension"], values["declination"], unit="deg", frame="icrs")
+    return _points(np.flatnonzero(usable), directions, values["flux"], spectrum)
 
 
 # Hurley-Walker et al. (2017), second release.
