@@ -13,10 +13,11 @@ from calstudy.base.visibilities import antenna_indices, antenna_pairs, baseline_
 from calstudy.experiment.model import FIGURES
 from calstudy.figures import Draw
 from calstudy.instrument.array_layouts.observatories import MwaLayout
+from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
 from calstudy.products.files import write_visibilities
-from calstudy.products.selection import layout_of, read_spectra, spread_in_length
+from calstudy.products.selection import read_spectra, spread_in_length
 from calstudy.run.task import Job
 
 INSTRUMENT = {
@@ -175,7 +176,7 @@ def _rms_transform(spectra: np.ndarray, frequency: np.ndarray) -> np.ndarray:
 
 
 def test_baselines_chosen_by_themselves_go_from_short_to_long(made):
-    layout = layout_of(MwaLayout())
+    layout = make_layout(MwaLayout())
     places = spread_in_length(layout, 4)
     lengths = [np.linalg.norm(layout.enu[b] - layout.enu[a]) for a, b in places]
     assert len(set(places)) == 4

@@ -172,20 +172,13 @@ class StudyFigure(Plugin):
 class InspectedFigure(StudyFigure):
     """A figure of two antennas in one integration, those of `outputs.inspect`: of their gains, or of their baseline."""
 
+    sections = ("instrument.layout", "outputs.inspect.antennas", "outputs.inspect.integration")
+
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the true gains and the calibration of `residual`."""
         experiment = graph.experiment
         fitted = calibration.calibration(graph, experiment.variants["residual"], experiment.outputs.inspect.realization)
         return {"gains": corruption.gains(graph), "calibration": fitted}
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the layout, the antennas and the integration."""
-        inspect = graph.experiment.outputs.inspect
-        return {
-            "layout": graph.experiment.instrument.layout,
-            "antennas": list(inspect.antennas),
-            "integration": inspect.integration,
-        }
 
 
 def _error_of_transfer(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:

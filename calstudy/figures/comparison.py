@@ -241,6 +241,11 @@ def _drawn(labels: Mapping[str, str], worlds: Sequence[Mapping[str, Case]]) -> b
     return any(label in world for label in labels.values() for world in worlds)
 
 
+def is_limit(bias: float, error: float) -> bool:
+    """Whether the bias is within two standard deviations of zero, so that only its upper limit is known."""
+    return bool(np.isfinite(error) and abs(bias) < SIGMAS * error)
+
+
 def _stalled(case: Case) -> bool:
     """Return True if most solves of a case stalled or failed."""
     counts = case.summary["by_status"]
@@ -264,7 +269,7 @@ def _draw_panel(
                     continue
                 bands = cases[label].bands
                 bias, error = float(bands.bias[band]), float(bands.bias_error[band])
-                limited = bool(np.isfinite(error)) and abs(bias) < SIGMAS * error
+                limited = is_limit(bias, error)
                 axes.plot(
                     upper_limit(bias, error) if limited else abs(bias),
                     row + SPREAD * ((place * len(kinds) + number + 0.5) / count - 0.5),

@@ -12,10 +12,10 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.table import number
 from calstudy.figures import CasesFigure
-from calstudy.figures.comparison import look
+from calstudy.figures.comparison import is_limit, look
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
-from calstudy.products.tolerances import BAND, LIMIT, SIGMAS, Fault, faults, upper_limit
+from calstudy.products.tolerances import BAND, LIMIT, Fault, faults, upper_limit
 from calstudy.run.task import Job
 from calstudy.verdicts.standing import is_measured
 
@@ -96,7 +96,7 @@ def _draw_band(
             shown, bias = _bias(bands.bias[band], bands.bias_error[band])
             if np.isfinite(shown):
                 colours[row, column] = shades.to_rgba(np.asarray(shown))
-            if _is_limit(bands.bias[band], bands.bias_error[band]):
+            if is_limit(bands.bias[band], bands.bias_error[band]):
                 axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, hatch="////", ec=FAINT, lw=0))
             axes.text(
                 column,
@@ -113,14 +113,9 @@ def _draw_band(
     axes.tick_params(length=0)
 
 
-def _is_limit(bias: float, error: float) -> bool:
-    """Whether the bias is within two standard deviations of zero, so that only its upper limit is known."""
-    return bool(np.isfinite(error) and abs(bias) < SIGMAS * error)
-
-
 def _bias(bias: float, error: float) -> tuple[float, str]:
     """Return the size that is coloured, the bias or its upper limit, and the text."""
-    if _is_limit(bias, error):
+    if is_limit(bias, error):
         limit = upper_limit(bias, error)
         return limit, f"bias < {_digits(limit)}"
     return abs(bias), f"bias {_digits(bias)}"

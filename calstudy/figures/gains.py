@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from calstudy.figures import Drawing, InspectedFigure, StudyFigure
+from calstudy.instrument.layouts import make_layout
 from calstudy.plotting import style
 from calstudy.plotting.axes import TwoDomains, delay_panel, frequency_and_delay, in_two_domains
 from calstudy.products import corruption
@@ -155,9 +156,9 @@ class Gains(InspectedFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw true and fitted gains of two antennas."""
-        from calstudy.products.selection import layout_of, read_aligned_gains, require_used
+        from calstudy.products.selection import read_aligned_gains, require_used
 
-        numbers = layout_of(job.settings["layout"]).numbers[job.settings["antennas"]].tolist()
+        numbers = make_layout(job.settings["layout"]).numbers[list(job.settings["antennas"])].tolist()
         gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
         rows = gains.rows(numbers)
         for row, number in zip(rows, numbers, strict=True):

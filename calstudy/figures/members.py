@@ -19,7 +19,7 @@ from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
 from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
-from calstudy.verdicts.tolerances import SPHERICAL_RULES, Drawn, Rules
+from calstudy.verdicts.tolerances import SPHERICAL_RULES, Drawn, Rules, own_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -73,10 +73,6 @@ def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
     return figure
 
 
-def _error(reference: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    return reference[f"{name.removesuffix('.bias')}.bias_error"]
-
-
 class MemberBiasFigure(StudyFigure):
     """The foregrounds that calibration leaves over the EoR, for every member of a collection."""
 
@@ -88,7 +84,7 @@ class MemberBiasFigure(StudyFigure):
         "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "
         "where it is not above its error. The dashed line is the EoR."
     )
-    tolerances: ClassVar[Rules] = ((r".*\.bias", Drawn(_error, "noise and what calibration leaves")),)
+    tolerances: ClassVar[Rules] = ((r".*\.bias", Drawn(own_error, "noise and what calibration leaves")),)
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the scores of a member."""
@@ -168,14 +164,10 @@ def _add_legend(figure: Figure) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = []
-    for marking in SOLVERS:
-        shape: dict[str, Any] = {"marker": marking.marker, "color": marking.colour, "markersize": marking.size + 0.8}
-        handles.append(Line2D([], [], linestyle="none", **shape))
+    handles: list[Any] = [marking.handle for marking in SOLVERS]
     handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
     handles.append(Line2D([], [], linestyle=":", color=style.GREY, linewidth=0.9))
-    open_marker: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
-    handles.append(Line2D([], [], linestyle="none", **open_marker))
+    handles.append(Line2D([], [], linestyle="none", **style.OPEN_MARKER))
     labels = [*(marking.label for marking in SOLVERS), r"$P^{S}$, 95% sample variance"]
     labels += [r"thermal noise, 95%", r"open: $P < 0$"]
     figure.legend(handles, labels, loc="outside upper center", ncols=5, columnspacing=1.0, handletextpad=0.3)

@@ -11,8 +11,8 @@ import numpy as np
 from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
-from calstudy.figures.spherical import Marking, draw_points
-from calstudy.figures.wedge import draw_panels
+from calstudy.figures.spherical import Marking, draw_points, magnitudes
+from calstudy.figures.wedge import draw_wedge
 from calstudy.plotting import style
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
@@ -61,8 +61,7 @@ def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer
         for mark in MARKINGS.values()
     ]
     handles.append(axes.plot([], [], color=style.GREY, label=r"noise of the residual, 1 $\sigma$")[0])
-    open_marker = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
-    handles.append(axes.plot([], [], linestyle="none", label=r"open: $P < 0$", **open_marker)[0])
+    handles.append(axes.plot([], [], linestyle="none", label=r"open: $P < 0$", **style.OPEN_MARKER)[0])
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     return figure
 
@@ -75,8 +74,7 @@ def _draw_noise(axes: Axes, residual: SphericalSpectrum) -> None:
 def _limits(columns: Mapping[str, Mapping[str, SphericalSpectrum]]) -> tuple[float, float]:
     """Return limits that hold all powers, but the faintest few points, which are noise about zero."""
     spectra = [spectrum for series in columns.values() for spectrum in series.values()]
-    values = np.abs(np.concatenate([spectrum.power.real for spectrum in spectra]))
-    values = values[np.isfinite(values) & (values > 0)]
+    values = magnitudes(spectra)
     errors = np.concatenate([series["residual"].noise_error for series in columns.values()])
     return 0.3 * float(min(np.quantile(values, 0.03), np.nanmin(errors) * SIGMAS_95)), 4 * float(values.max())
 
@@ -137,7 +135,7 @@ class ObservedWedge(StudyFigure):
         """Draw a panel for each spectrum."""
         folder = job.inputs["spectra"]
         found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
-        figure = draw_panels(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY)
+        figure = draw_wedge(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY)
         return Drawing(figure, found)
 
 

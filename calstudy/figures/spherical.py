@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -56,6 +56,13 @@ class Marking(NamedTuple):
     colour: str
     size: float
     shift: float = 0.0
+
+    @property
+    def handle(self) -> Line2D:
+        """Its entry of a legend, a little larger than in the figure."""
+        from matplotlib.lines import Line2D
+
+        return Line2D([], [], linestyle="none", marker=self.marker, color=self.colour, markersize=self.size + 0.8)
 
 
 MARKINGS = {
@@ -171,22 +178,23 @@ def _present(columns: Sequence[SphericalColumn], names: Sequence[str]) -> list[S
     return [spectrum for spectrum in spectra if spectrum is not None]
 
 
-def _magnitudes(spectra: Sequence[SphericalSpectrum]) -> np.ndarray:
+def magnitudes(spectra: Sequence[SphericalSpectrum]) -> np.ndarray:
+    """Return |P| of all bins of some spectra where it is known and not zero."""
     values = np.abs(np.concatenate([spectrum.power.real for spectrum in spectra]))
     return values[np.isfinite(values) & (values > 0)]
 
 
 def _full_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
     """Return limits that hold all but the faintest few points, which are noise about zero."""
-    values = _magnitudes(_present(columns, ("eor", *MARKINGS)))
+    values = magnitudes(_present(columns, ("eor", *MARKINGS)))
     return 0.5 * float(np.quantile(values, 0.02)), 4 * float(values.max())
 
 
 def _zoom_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
     """Return limits from below the noise to above the EoR and the residuals."""
-    low = min(np.median(_magnitudes([spectrum])) for spectrum in _present(columns, ("eor", *ZOOMED)))
+    low = min(np.median(magnitudes([spectrum])) for spectrum in _present(columns, ("eor", *ZOOMED)))
     bands = [column.eor.power.real + SIGMAS_95 * column.eor.error for column in columns]
-    residuals = [_magnitudes([item]).max() for item in _present(columns, ("residual",))]
+    residuals = [magnitudes([item]).max() for item in _present(columns, ("residual",))]
     return 0.1 * float(low), 2 * float(max(*(np.nanmax(band) for band in bands), *residuals, low))
 
 
@@ -213,18 +221,11 @@ def _add_legend(
     labels: list[str] = []
     for name in LEGEND_ORDER:
         if _present(columns, (name,)):
-            marking = MARKINGS[name]
-            shape: dict[str, Any] = {
-                "marker": marking.marker,
-                "color": marking.colour,
-                "markersize": marking.size + 0.8,
-            }
-            handles.append(Line2D([], [], linestyle="none", **shape))
-            labels.append(marking.label)
+            handles.append(MARKINGS[name].handle)
+            labels.append(MARKINGS[name].label)
     handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
     labels.append(r"$P^{S}$, 95% sample variance")
-    open_marker: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": style.GREY, "markersize": 4}
-    handles.append(Line2D([], [], linestyle="none", **open_marker))
+    handles.append(Line2D([], [], linestyle="none", **style.OPEN_MARKER))
     labels.append(r"open: $P < 0$")
     spacing: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
     ncols = 7 if len(columns) == 2 else 3
@@ -332,23 +333,6 @@ class SphericalExcised(Spherical):
         return self.drawn({"excised": self.excised(job)}, job)
 
 
-def draw_spherical_comparison(
-    minimally_redundant: SphericalColumn,
-    redundant: SphericalColumn,
-    zoom_k: float = 1.0,
-) -> Figure:
-    """Draw both arrays as `draw_spherical` does, the minimally redundant one left and the redundant one right.
-
-    The columns should average the same Fourier modes: those outside the wedge and its buffer. Their titles are replaced
-    by the names of the arrays.
-    """
-    columns = (
-        replace(minimally_redundant, title="Minimally redundant"),
-        replace(redundant, title="Redundant"),
-    )
-    return draw_spherical(columns, zoom_k)
-
-
 class SphericalComparison(StudyFigure):
     """Spherical power spectra outside the wedge of the members in the roles `minimally_redundant` and `redundant`."""
 
@@ -365,5 +349,4 @@ class SphericalComparison(StudyFigure):
             role: read_column(job.inputs[f"spectra:{role}"], title, "outside-wedge")
             for role, title in self.titles.items()
         }
-        figure = draw_spherical_comparison(columns["minimally_redundant"], columns["redundant"])
-        return Drawing(figure, columns)
+        return Drawing(draw_spherical(list(columns.values())), columns)

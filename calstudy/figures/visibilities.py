@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from calstudy.figures import Drawing, InspectedFigure, StudyFigure
+from calstudy.instrument.layouts import make_layout
 from calstudy.plotting import style
 from calstudy.plotting.axes import (
     TAPER,
@@ -97,10 +98,10 @@ def draw_model(comparison: VisibilityComparison) -> Figure:
 
 def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], float, Visibilities]:
     """Return the shown baseline, its length and, in fitted channels, its reference, fitted model and noise."""
-    from calstudy.products.selection import baseline, layout_of, read_spectra, read_used, require_used
+    from calstudy.products.selection import baseline, read_spectra, read_used, require_used
 
     integration = job.settings["integration"]
-    pair, length = baseline(layout_of(job.settings["layout"]), job.settings["antennas"])
+    pair, length = baseline(make_layout(job.settings["layout"]), job.settings["antennas"])
     paths = (reference, job.inputs["calibration"] / MODEL, job.inputs["noise"] / DATA)
     used = read_used(paths[1], [pair])[0, integration]
     require_used(used, pair, integration)
@@ -282,16 +283,9 @@ class Baselines(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the RMS over time of delay transforms of some baselines."""
-        from calstudy.products.selection import (
-            baseline,
-            layout_of,
-            read_gains,
-            read_spectra,
-            read_used,
-            spread_in_length,
-        )
+        from calstudy.products.selection import baseline, read_gains, read_spectra, read_used, spread_in_length
 
-        layout = layout_of(job.settings["layout"])
+        layout = make_layout(job.settings["layout"])
         places = job.settings["baselines"] or spread_in_length(layout, SHOWN_BASELINES)
         pairs, lengths = zip(*(baseline(layout, place) for place in places), strict=True)
         gains = read_gains(job.inputs["calibration"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,21 +27,6 @@ NEGATIVE = ("#e3f1fb", "#7fbfe8", "#2b7bbd", "#0b3a75")
 EMPTY = "0.8"
 
 
-@dataclass(frozen=True)
-class WedgePanels:
-    """The five cylindrical spectra, of the same delays.
-
-    `uncorrupted` is P^{S+N+F} with perfect gains, `uncalibrated` P^V with gain errors, `residual` the calibrated P^R,
-    `eor` P^S alone, and `noise` P^N alone.
-    """
-
-    uncorrupted: CylindricalSpectrum
-    uncalibrated: CylindricalSpectrum
-    residual: CylindricalSpectrum
-    eor: CylindricalSpectrum
-    noise: CylindricalSpectrum
-
-
 TITLES = {
     "uncorrupted": r"$P^{S+N+F}$",
     "uncalibrated": r"$P^{V}$",
@@ -50,28 +34,23 @@ TITLES = {
     "eor": r"$P^{S}$",
     "noise": r"$P^{N}$",
 }
+"""Perfect gains, gain errors, the calibrated residual, the EoR alone, and noise alone."""
 
 
-def draw_wedge(panels: WedgePanels, buffer: float = 100e-9, max_delay: float | None = 2e-6) -> Figure:
-    """Draw the real parts of five cylindrical power spectra on one scale of colours, negative values in blue.
+@style.journal_style()
+def draw_wedge(
+    spectra: Mapping[str, CylindricalSpectrum],
+    titles: Mapping[str, str] = TITLES,
+    buffer: float = 100e-9,
+    max_delay: float | None = 2e-6,
+) -> Figure:
+    """Draw the real parts of cylindrical power spectra, by name, on one scale of colours, negative values in blue.
 
     Spectra have strictly increasing baseline lengths and delays >= 0, power in mK² h⁻³ Mpc³. The dashed line is
     `buffer` (s) above the horizon. The delay axis ends at `max_delay`, s, if that is not None and within the delays.
     Raise ValueError if the axes of a spectrum are not increasing or do not match its power, or the delays of two
     spectra differ.
     """
-    spectra = {name: getattr(panels, name) for name in TITLES}
-    return draw_panels(spectra, TITLES, buffer, max_delay)
-
-
-@style.journal_style()
-def draw_panels(
-    spectra: Mapping[str, CylindricalSpectrum],
-    titles: Mapping[str, str],
-    buffer: float,
-    max_delay: float | None,
-) -> Figure:
-    """Draw the real parts of several cylindrical power spectra, by their names, as `draw_wedge` does."""
     from matplotlib.colors import LogNorm
 
     first = next(iter(spectra.values()))
@@ -172,6 +151,5 @@ class Wedge(StudyFigure):
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each variant."""
         tables = Tables((job.inputs["spectra"],))
-        panels = WedgePanels(**{name: tables.wedge(name) for name in self.variants})
-        figure = draw_wedge(panels, buffer=job.settings["wedge_buffer"])
-        return Drawing(figure, panels)
+        spectra = {name: tables.wedge(name) for name in self.variants}
+        return Drawing(draw_wedge(spectra, buffer=job.settings["wedge_buffer"]), spectra)

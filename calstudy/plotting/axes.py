@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,9 @@ from calstudy.power.delay import channel_width, delay_transform, delays, horizon
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from calstudy.power.spectra import CylindricalSpectrum
+    from calstudy.power.transfer import TransferMap
 
 
 TAPER = "blackman-harris"
@@ -83,28 +86,7 @@ def name_baseline(axes: Axes, antennas: tuple[int, int], baseline_length: float)
     axes.text(0.97, 0.95, label, transform=axes.transAxes, ha="right", va="top", fontsize=style.SMALL_SIZE + 0.5)
 
 
-class Cylinder(Protocol):
-    """The axes of quantities per baseline length and delay, as in `calstudy.power.spectra.CylindricalSpectrum`."""
-
-    @property
-    def baseline_length(self) -> np.ndarray:
-        """Mean baseline length of each bin in m, (Nb,)."""
-
-    @property
-    def bin_edges(self) -> np.ndarray:
-        """Edges of the bins of baseline length in m, (Nb, 2)."""
-
-    @property
-    def k_perp(self) -> np.ndarray:
-        """k_perp of each bin in h/Mpc, (Nb,)."""
-
-    @property
-    def delay(self) -> np.ndarray:
-        """Delays in s, (Nd,)."""
-
-    @property
-    def k_parallel(self) -> np.ndarray:
-        """k_parallel of each delay in h/Mpc, (Nd,)."""
+Cylinder: TypeAlias = "CylindricalSpectrum | TransferMap"
 
 
 def length_cells(cylinder: Cylinder) -> tuple[np.ndarray, np.ndarray]:

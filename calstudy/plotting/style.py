@@ -32,7 +32,6 @@ BLACK = "#000000"
 ORANGE = "#E69F00"
 CYAN = "#56B4E9"
 GREEN = "#009E73"
-YELLOW = "#F0E442"
 BLUE = "#0072B2"
 RED = "#D55E00"
 MAGENTA = "#CC79A7"
@@ -41,6 +40,8 @@ BAND = "#C9C9C9"
 
 SERIES = (("o", BLUE), ("s", ORANGE), ("D", GREEN), ("^", MAGENTA), ("v", RED))
 """Marker and colour of several series of points."""
+OPEN_MARKER: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": GREY, "markersize": 4}
+"""What stands for negative points in a legend."""
 
 FREQUENCY = "frequency (MHz)"
 DELAY = "delay (ns)"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +10,9 @@ import numpy as np
 from pyuvdata import UVCal, UVData
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
+from calstudy.base.visibilities import flag_cube, rows_of, to_cube
 from calstudy.calibrate.degeneracy import align
-from calstudy.instrument import settings as section
-from calstudy.instrument.layouts import Layout, make_layout
+from calstudy.instrument.layouts import Layout
 from calstudy.products.files import GAINS
 
 
@@ -96,18 +95,18 @@ def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
 
     The antenna numbers must have the order of the product.
     """
-    uvd = UVData.from_file(path, file_type="uvh5", bls=list(pairs), run_check=False)
-    found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
-    cube = to_cube(uvd)[..., 0]
-    return np.stack([cube[:, found.index(tuple(pair))] for pair in pairs])
+    return _of_pairs(path, pairs, to_cube)
 
 
 def read_used(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
     """Read which samples of some baselines are unflagged, bool, (len(pairs), Ntimes, Nfreqs); see `read_spectra`."""
+    return ~_of_pairs(path, pairs, flag_cube)
+
+
+def _of_pairs(path: Path, pairs: Sequence[tuple[int, int]], cube_of: Callable[[UVData], np.ndarray]) -> np.ndarray:
     uvd = UVData.from_file(path, file_type="uvh5", bls=list(pairs), run_check=False)
-    found = [tuple(pair) for pair in antenna_pairs(uvd).tolist()]
-    used = ~flag_cube(uvd)[..., 0]
-    return np.stack([used[:, found.index(tuple(pair))] for pair in pairs])
+    cube = cube_of(uvd)[..., 0]
+    return np.stack([cube[:, row] for row in rows_of(uvd, np.array(pairs))])
 
 
 def require_used(used: np.ndarray, numbers: Sequence[int], integration: int) -> None:
@@ -118,11 +117,6 @@ def require_used(used: np.ndarray, numbers: Sequence[int], integration: int) -> 
             f"outputs.inspect: integration {integration} has no data or no solution of antenna {named}; choose another "
             "integration, or other antennas"
         )
-
-
-def layout_of(settings: section.Layout) -> Layout:
-    """Return the layout that settings describe."""
-    return make_layout(settings)
 
 
 def baseline(layout: Layout, places: Sequence[int]) -> tuple[tuple[int, int], float]:

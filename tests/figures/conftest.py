@@ -12,7 +12,7 @@ from calstudy.figures.gains import compare_gains, draw_gains, draw_reflections
 from calstudy.figures.layout import LayoutPanel, draw_layouts
 from calstudy.figures.members import draw_solver_comparison
 from calstudy.figures.runtime import draw_runtime, summarize_runtime
-from calstudy.figures.spherical import SphericalColumn, draw_spherical, draw_spherical_comparison
+from calstudy.figures.spherical import SphericalColumn, draw_spherical
 from calstudy.figures.visibilities import (
     BaselineSpectra,
     Visibilities,
@@ -22,7 +22,7 @@ from calstudy.figures.visibilities import (
     draw_data,
     draw_model,
 )
-from calstudy.figures.wedge import WedgePanels, draw_wedge
+from calstudy.figures.wedge import TITLES, draw_wedge
 from calstudy.plotting import style
 from calstudy.plotting.axes import in_two_domains
 from calstudy.power.delay import delays
@@ -52,7 +52,7 @@ def make_wedge_spectrum() -> Callable[..., CylindricalSpectrum]:
 
 
 @pytest.fixture(scope="session")
-def wedge_panels(make_wedge_spectrum) -> WedgePanels:
+def wedge_panels(make_wedge_spectrum) -> dict[str, CylindricalSpectrum]:
     rng = np.random.default_rng(11)
     lower = 4.0 * np.concatenate([[2, 3], np.arange(6, 40, 3)])
     edges, delay = np.column_stack([lower, lower + 4]), np.arange(60) / 30.72e6
@@ -62,7 +62,7 @@ def wedge_panels(make_wedge_spectrum) -> WedgePanels:
     eor, noise = 3e7 * rng.exponential(size=shape), 6e7 * rng.normal(size=shape)
     leaked = 1e12 * rng.exponential(size=shape)
     powers = (foregrounds + eor + noise, foregrounds + leaked, ~inside * (eor + noise), eor, noise)
-    return WedgePanels(*(make_wedge_spectrum(power, edges, delay) for power in powers))
+    return {name: make_wedge_spectrum(power, edges, delay) for name, power in zip(TITLES, powers, strict=True)}
 
 
 @pytest.fixture(scope="session")
@@ -151,7 +151,6 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
             "wedge": lambda: draw_wedge(wedge_panels),
             "spherical": lambda: draw_spherical([make_column(1), excised]),
             "spherical one column": lambda: draw_spherical([excised]),
-            "spherical comparison": lambda: draw_spherical_comparison(excised, make_column(3, empty=1)),
             "solver comparison": lambda: draw_solver_comparison(
                 {"one": (make_column(4), excised), "two": (excised, make_column(3, empty=1))}
             ),

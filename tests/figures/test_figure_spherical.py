@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import same_color, to_rgba
 
-from calstudy.figures.spherical import MARKINGS, draw_spherical, draw_spherical_comparison
+from calstudy.figures.spherical import MARKINGS, draw_spherical
 from calstudy.power.limits import Limits
 
 CAPTION = {
@@ -110,14 +110,6 @@ def test_legend_follows_the_caption(columns):
     handles = figure.legends[0].legend_handles[:5]
     seen = [(handle.get_marker(), handle.get_color()) for handle in handles]
     assert seen == list(CAPTION.values())
-
-
-def test_comparison_names_the_arrays_and_draws_the_same(columns):
-    figure = draw_spherical_comparison(*columns)
-    assert [axes.get_title() for axes in figure.axes[:2]] == ["Minimally redundant", "Redundant"]
-    for axes, other in zip(figure.axes, draw_spherical(columns).axes, strict=True):
-        for label, container in drawn(other).items():
-            np.testing.assert_array_equal(drawn(axes)[label].lines[0].get_xydata(), container.lines[0].get_xydata())
 
 
 def test_spectra_that_cannot_be_drawn_are_refused(columns):

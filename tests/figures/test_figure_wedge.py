@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.collections import QuadMesh
 
-from calstudy.figures.wedge import TITLES, WedgePanels, draw_wedge
+from calstudy.figures.wedge import TITLES, draw_wedge
 
 C = 299792458.0
 quick = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -37,7 +37,7 @@ def test_panels_are_those_of_the_paper_in_its_order(wedge_panels):
 def test_each_cell_shows_its_signed_power(wedge_panels):
     figure = draw_wedge(wedge_panels, max_delay=None)
     for axes, name in zip(figure.axes, TITLES, strict=False):
-        spectrum = getattr(wedge_panels, name)
+        spectrum = wedge_panels[name]
         floor = axes.collections[0].norm.vmin
         for (b, d), power in np.ndenumerate(spectrum.power.real):
             seen = signed_power_at(axes, spectrum.k_perp[b], spectrum.k_parallel[d])
@@ -51,7 +51,7 @@ def test_lengths_without_baselines_stay_empty(make_wedge_spectrum, present):
     spectrum = make_wedge_spectrum(
         1e7 + np.arange(4) * np.ones((lower.size, 1)), np.column_stack([lower, lower + 3]), np.arange(4) * 1e-7
     )
-    axes = draw_wedge(WedgePanels(*[spectrum] * 5), max_delay=None).axes[0]
+    axes = draw_wedge(dict.fromkeys(TITLES, spectrum), max_delay=None).axes[0]
     for number in range(present[0], present[-1] + 1):
         seen = signed_power_at(axes, 5.55e-4 * 3.0 * (number + 0.5), spectrum.k_parallel[2])
         assert np.isfinite(seen) == (number in present)
@@ -59,10 +59,10 @@ def test_lengths_without_baselines_stay_empty(make_wedge_spectrum, present):
 
 
 def test_missing_power_is_not_drawn(wedge_panels):
-    power = wedge_panels.residual.power.copy()
+    power = wedge_panels["residual"].power.copy()
     power[3, 5] = np.nan
-    spectrum = replace(wedge_panels.residual, power=power)
-    axes = draw_wedge(replace(wedge_panels, residual=spectrum)).axes[2]
+    spectrum = replace(wedge_panels["residual"], power=power)
+    axes = draw_wedge({**wedge_panels, "residual": spectrum}).axes[2]
     assert np.isnan(signed_power_at(axes, spectrum.k_perp[3], spectrum.k_parallel[5]))
 
 
@@ -79,7 +79,7 @@ def test_positive_is_warm_negative_is_blue_and_all_panels_share_the_colours(wedg
         assert (blue > red + 0.1).all()
     assert len(norms) == 1
     floor, highest, same_floor, lowest = norms.pop()
-    spectra = [getattr(wedge_panels, name).power.real for name in TITLES]
+    spectra = [wedge_panels[name].power.real for name in TITLES]
     assert floor == same_floor
     assert highest >= max(power.max() for power in spectra)
     assert lowest >= -min(power.min() for power in spectra)
@@ -108,7 +108,7 @@ def test_delay_axis_ends_where_asked_but_not_beyond_the_data(wedge_panels):
 
 
 def test_spectra_that_cannot_be_drawn_are_refused(wedge_panels):
-    spectrum = wedge_panels.eor
+    spectrum = wedge_panels["eor"]
     for bad, message in (
         (replace(spectrum, power=spectrum.power[:, 1:]), "'eor': power has shape"),
         (replace(spectrum, delay=spectrum.delay - 1e-6), "'eor': delay is not strictly increasing from 0"),
@@ -116,4 +116,4 @@ def test_spectra_that_cannot_be_drawn_are_refused(wedge_panels):
         (replace(spectrum, delay=2 * spectrum.delay), "'eor': its delays differ"),
     ):
         with pytest.raises(ValueError, match=message):
-            draw_wedge(replace(wedge_panels, eor=bad))
+            draw_wedge({**wedge_panels, "eor": bad})
