@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple
 
 Outcome = Literal["PASS", "FAIL", "supported", "contradicted", "undecided", "not evaluated"]
 """PASS and FAIL are for limits of our own; the next three are for statements of others."""
@@ -29,25 +29,6 @@ class Finding(NamedTuple):
     kind: Kind = "error"
 
 
-class Threshold(Protocol):
-    """Interface of conditions on a measured number, from `low` to `high`, by `sigmas`; `str` gives the words."""
-
-    @property
-    def low(self) -> float:
-        """Smallest number that meets it."""
-
-    @property
-    def high(self) -> float:
-        """Largest number that meets it."""
-
-    @property
-    def sigmas(self) -> float:
-        """Number of uncertainties by which a number must be within it or, for a single value, may deviate."""
-
-    def holds(self, finding: Finding) -> bool:
-        """Return true if the number meets it."""
-
-
 @dataclass(frozen=True)
 class Within:
     """From `low` to `high`."""
@@ -66,44 +47,34 @@ class Within:
 
 @dataclass(frozen=True)
 class AtLeast:
-    """At least `bound`, by `sigmas` times the uncertainty."""
+    """At least `low`, by `sigmas` times the uncertainty."""
 
-    bound: float
+    low: float
     sigmas: float = 0.0
     high: ClassVar[float] = math.inf
 
-    @property
-    def low(self) -> float:
-        """The bound."""
-        return self.bound
-
     def holds(self, finding: Finding) -> bool:
         """Return true if the value is that far above the bound."""
-        return finding.value - self.sigmas * finding.uncertainty >= self.bound
+        return finding.value - self.sigmas * finding.uncertainty >= self.low
 
     def __str__(self) -> str:
-        return f">= {self.bound:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
+        return f">= {self.low:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
 
 
 @dataclass(frozen=True)
 class AtMost:
-    """At most `bound`, by `sigmas` times the uncertainty."""
+    """At most `high`, by `sigmas` times the uncertainty."""
 
-    bound: float
+    high: float
     sigmas: float = 0.0
     low: ClassVar[float] = -math.inf
 
-    @property
-    def high(self) -> float:
-        """The bound."""
-        return self.bound
-
     def holds(self, finding: Finding) -> bool:
         """Return true if the value is that far below the bound."""
-        return finding.value + self.sigmas * finding.uncertainty <= self.bound
+        return finding.value + self.sigmas * finding.uncertainty <= self.high
 
     def __str__(self) -> str:
-        return f"<= {self.bound:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
+        return f"<= {self.high:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
 
 
 @dataclass(frozen=True)
@@ -129,6 +100,12 @@ class Equal:
 
     def __str__(self) -> str:
         return f"{self.target:.3g} within {self.sigmas:g} sigma"
+
+
+Threshold = Within | AtLeast | AtMost | Equal
+"""A condition on a measured number: it `holds` from `low` to `high`, and `str` gives its words.
+
+By `sigmas` uncertainties a number must be within it or, for a single value, may deviate."""
 
 
 @dataclass(frozen=True)

@@ -239,7 +239,7 @@ CRITICAL_WHY = "without it ten minutes at least, which would still be minutes"
 @COMPUTATION.states(
     CRITICAL_SENTENCE,
     "paper's steps on one core to 1 % above the minimum, the array that is closest to that whose steps were counted, s",
-    AtLeast(MINUTES.bound),
+    AtLeast(MINUTES.high),
     CRITICAL_WHY,
 )
 def gpu_critical_for_paper_solver(run: RunTimeTable) -> Finding:
@@ -251,7 +251,7 @@ def gpu_critical_for_paper_solver(run: RunTimeTable) -> Finding:
 @COMPUTATION.states(
     CRITICAL_SENTENCE,
     "the default solver's whole solve on one core without a GPU, largest array, s",
-    AtLeast(MINUTES.bound),
+    AtLeast(MINUTES.high),
     CRITICAL_WHY,
 )
 def gpu_critical_for_default_solver(run: RunTimeTable) -> Finding:
