@@ -179,16 +179,7 @@ def refusal_of_role(papers: Sequence[Paper], role: str, experiment: Experiment) 
 INSTEAD = "name a paper by --paper, or use --run-code if you trust who wrote the folder"
 
 
-@dataclass(frozen=True)
-class EvaluatedRun:
-    """The claims of one run folder, its name, and a sentence for each paper in which it plays no role."""
-
-    title: str
-    claims: list[Verdict]
-    without_role: tuple[str, ...] = ()
-
-
-def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> EvaluatedRun:
+def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> Evaluation:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
     If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too.
@@ -205,14 +196,13 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
         found, by_solver = _evaluated(run, named)
-    evaluated = EvaluatedRun(run.name, found.verdicts, found.without_role)
     try:
-        write_claims(found.verdicts, folder, evaluated.title, run.manifest["stand_ins"], found.without_role)
+        write_claims(found.verdicts, folder, run.name, run.manifest["stand_ins"], found.without_role)
         if by_solver:
-            write_claims_by_solver(by_solver, folder, evaluated.title, run.manifest["stand_ins"])
+            write_claims_by_solver(by_solver, folder, run.name, run.manifest["stand_ins"])
     except OSError as error:
         raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
-    return evaluated
+    return found
 
 
 def _require_evaluable(run: RunFolder) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +9,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.cli.options import AsJson, MaxMemory, Scheduler, Set, Workers
+from calstudy.cli.options import AsJson, MaxMemory, Runs, Scheduler, Set, Workers, with_runs
 
 if TYPE_CHECKING:
     from calstudy.regression import Regression
@@ -101,10 +100,7 @@ def validate(
     scale: Annotated[str, typer.Option(help="'full', or 'small': the same in a minute or two.")] = "full",
     workers: Workers = 1,
     max_memory: MaxMemory = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
-    ] = None,
+    output: Runs = None,
     overrides: Set = None,
     as_json: AsJson = False,
 ) -> None:
@@ -117,8 +113,7 @@ def validate(
     from calstudy.validation.ladder import Ladder, passed, run_ladder, tally
     from calstudy.verdicts.tables import show_verdicts, to_json
 
-    changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
-    ladder = Ladder.load(StudyFile(Path(), {"steps": steps or ()}, scale, changes))
+    ladder = Ladder.load(StudyFile(Path(), {"steps": steps or ()}, scale, with_runs(overrides, output)))
     console = Console(soft_wrap=True, highlight=False, stderr=as_json)
     folder, verdicts = run_ladder(ladder, Budget(workers, max_memory), console)
     if as_json:

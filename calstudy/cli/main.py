@@ -25,7 +25,19 @@ from calstudy.base.package_files import MWA_FILES
 from calstudy.cli.calibrate import calibrate, compare_gains
 from calstudy.cli.checks import regress, validate
 from calstudy.cli.export import export, leaderboard, score
-from calstudy.cli.options import AsJson, MaxMemory, Overwrite, Scale, Scheduler, Sections, Set, StudyFile, Workers
+from calstudy.cli.options import (
+    AsJson,
+    MaxMemory,
+    Overwrite,
+    Runs,
+    Scale,
+    Scheduler,
+    Sections,
+    Set,
+    StudyFile,
+    Workers,
+    with_runs,
+)
 from calstudy.cli.start import init, write_schema
 from calstudy.cli.storage import runs, store
 from calstudy.cli.which import which
@@ -55,10 +67,6 @@ app.command()(store)
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130
 
-Output = Annotated[
-    Path | None,
-    typer.Option(metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
-]
 Finished = Annotated[
     list[Path] | None,
     typer.Option(
@@ -94,7 +102,7 @@ def run(
     workers: Workers = None,
     max_memory: MaxMemory = None,
     scheduler: Scheduler = None,
-    output: Output = None,
+    output: Runs = None,
     finished: Finished = None,
     strict: Strict = False,
 ) -> None:
@@ -108,8 +116,7 @@ def run(
     from calstudy.studies.study import run_study
 
     console = Console(soft_wrap=True, highlight=False)
-    changes = [*(overrides or ()), *([] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"])]
-    study = load_study(file, scale, changes)
+    study = load_study(file, scale, with_runs(overrides, output))
     if finished:
         _require_not_strict(strict)
         study = study.with_finished(finished, console)
@@ -171,25 +178,25 @@ def claims(
     Of several folders the written verdicts are shown together, and none is written: of each statement that of the last
     folder that evaluates it, so that studies with realizations come last.
     """
-    from calstudy.claims.evaluation import EvaluatedRun, evaluate_folder
+    from calstudy.claims.evaluation import Evaluation, evaluate_folder
     from calstudy.results.reader import RunFolder
     from calstudy.verdicts.tables import combined, show_verdicts, to_json
 
     console = Console(highlight=False)
+    runs = [RunFolder(path) for path in (folder, *(others or ()))]
     if others:
         if paper or run_code:
             raise InputError("--paper, --run-code: are for a single folder, whose verdicts are found anew")
-        runs = [RunFolder(path) for path in (folder, *others)]
         if without := [str(run.path) for run in runs if not run.has_claims]:
             raise InputError(f"{', '.join(without)}: has no verdicts (claims.json)")
-        evaluated = EvaluatedRun(", ".join(run.name for run in runs), combined(run.claims for run in runs))
+        evaluated = Evaluation(combined(run.claims for run in runs))
     else:
         evaluated = evaluate_folder(folder, paper or (), run_code)
     if as_json:
-        typer.echo(to_json(evaluated.claims))
+        typer.echo(to_json(evaluated.verdicts))
         return
-    if evaluated.claims:
-        show_verdicts(evaluated.claims, evaluated.title, console)
+    if evaluated.verdicts:
+        show_verdicts(evaluated.verdicts, ", ".join(run.name for run in runs), console)
     for sentence in evaluated.without_role:
         console.print(sentence, markup=False)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,8 +36,19 @@ Scheduler = Annotated[
         help="Use a running dask cluster in place of own workers: its address, or the scheduler file that it wrote.",
     ),
 ]
+Runs = Annotated[
+    Path | None,
+    typer.Option("--output", metavar="FOLDER", help="Where the run gets its folder: --set outputs.runs=FOLDER."),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that an earlier call wrote.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a table, for programs.")]
+
+
+def with_runs(overrides: list[str] | None, output: Path | None) -> list[str]:
+    """Return the changes of a file by --set and --output."""
+    runs = [] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"]
+    return [*(overrides or ()), *runs]
+
 
 SECTIONS = {
     "Every day": ("init", "which", "plan", "run", "calibrate", "report"),

@@ -597,15 +597,15 @@ def test_a_run_folder_is_evaluated_and_written(make_study, tmp_path):
     study = make_study("tables")
     folder = run_folder(study, tmp_path)
     evaluated = evaluate_folder(folder)
-    assert verdicts(evaluated.claims) == verdicts(alone(study))
-    assert from_json((folder / "claims.json").read_text()) == evaluated.claims
+    assert verdicts(evaluated.verdicts) == verdicts(alone(study))
+    assert from_json((folder / "claims.json").read_text()) == evaluated.verdicts
     assert "Stand-in: a small sky." in (folder / "claims.md").read_text()
 
 
 def test_claims_md_says_why_there_are_none(make_study, tmp_path):
     folder = run_folder(make_study("tables", facts={"calibration": {"calibrator": "sky-based"}}), tmp_path)
     evaluated = evaluate_folder(folder)
-    assert evaluated.claims == from_json((folder / "claims.json").read_text()) == []
+    assert evaluated.verdicts == from_json((folder / "claims.json").read_text()) == []
     assert (folder / "claims.md").read_text().endswith(f"\n{evaluated.without_role[0]}\n")
 
 
@@ -615,7 +615,7 @@ def test_folders_that_cannot_be_evaluated_are_told(make_study, tmp_path):
     folder = run_folder(make_study("tables", facts={"papers": []}), tmp_path)
     with pytest.raises(InputError, match=r"names no papers; give one with --paper \(.*calamity2022, .*or a file\.py\)"):
         evaluate_folder(folder)
-    assert evaluate_folder(folder, ["calamity2022"]).claims
+    assert evaluate_folder(folder, ["calamity2022"]).verdicts
     with pytest.raises(InputError, match="'calamity' is not a paper"):
         evaluate_folder(folder, ["calamity"])
     (folder / "manifest.json").write_text(json.dumps({"name": "sweep", "stand_ins": [], "parts": {"a": "points/a"}}))

@@ -147,5 +147,5 @@ def test_members_of_a_collection_play_its_roles(folder):
     path.write_text(yaml.safe_dump(collection))
     run = run_study(load_study(path), Budget(workers=1))
     assert verdicts(run.folder) == VERDICTS
-    assert evaluate_folder(run.folder).claims == from_json((run.folder / "claims.json").read_text())
+    assert evaluate_folder(run.folder).verdicts == from_json((run.folder / "claims.json").read_text())
     assert json.loads((run.folder / "manifest.json").read_text())["roles"] == {"hexagon": "tiny"}

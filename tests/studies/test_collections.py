@@ -127,7 +127,7 @@ def test_combined_claims_hold_each_member_to_its_role(finished):
 def test_claims_are_the_same_evaluated_from_the_folders(finished):
     for folder in (finished.folder, finished.parts["redundant"].folder):
         written = from_json((folder / "claims.json").read_text())
-        assert evaluate_folder(folder).claims == written
+        assert evaluate_folder(folder).verdicts == written
 
 
 def test_a_second_run_makes_nothing_and_a_member_alone_has_everything(finished, collection, folder):
@@ -241,7 +241,7 @@ def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished
             np.array_equal(arrays[0][key], arrays[1][key], equal_nan=True) for key in arrays[0] if key[-5:] != "title"
         )
     claims = [from_json((run.folder / "claims.json").read_text()) for run in (finished, result)]
-    assert claims[0] == claims[1] == evaluate_folder(result.folder).claims
+    assert claims[0] == claims[1] == evaluate_folder(result.folder).verdicts
 
 
 def test_a_member_can_come_from_a_reference_and_others_are_run(finished, folder, tmp_path):

@@ -260,7 +260,7 @@ class Any(Paper):
 def test_claims_are_those_that_realizations_measure(finished, folder, tmp_path):
     """The numbers of the folder's arrays, those of the product of the run, and those of its table."""
     (tmp_path / "any.py").write_text(PAPER)
-    (claim,) = evaluate_folder(finished.folder, [str(tmp_path / "any.py")]).claims
+    (claim,) = evaluate_folder(finished.folder, [str(tmp_path / "any.py")]).verdicts
     assert (claim.name, claim.runs, claim.verdict) == ("recovered", (finished.folder.name.split("-")[0],), "supported")
     data = small(folder, papers=[str(tmp_path / "any.py")], outputs__runs=str(tmp_path / "runs"))
     again = run_study(Realizations(validate(data, folder)), Budget(workers=1))

@@ -72,7 +72,7 @@ def test_known_powers_come_back_in_figures_tables_and_claims(study):
         rows = [row for row in csv.DictReader(file) if row["panel"] == "rows" and row["timed"] == "default-solve"]
     assert [int(row["antennas"]) for row in rows] == [9, 12, 16]
     assert [float(row["median [s]"]) for row in rows] == pytest.approx([1e-3 * n**1.6 for n in (9, 12, 16)])
-    claims = {claim.name: claim for claim in evaluate_folder(run.folder).claims}
+    claims = {claim.name: claim for claim in evaluate_folder(run.folder).verdicts}
     expected = {
         "paper-step-quadratic-in-antennas": (2.1, "supported"),
         "own-step-quadratic-in-antennas": (1.9, "supported"),
@@ -114,7 +114,7 @@ def test_times_are_measured_once_on_a_machine_and_again_on_another(study, monkey
 def test_a_gpu_is_compared_with_the_processor(study, monkeypatch):
     monkeypatch.setattr(runtime, "_gpu", lambda: "some GPU")
     run = run_study(reload("runtime.devices=[cpu, gpu]"), Budget(workers=1))
-    claims = {claim.name: claim for claim in evaluate_folder(run.folder).claims}
+    claims = {claim.name: claim for claim in evaluate_folder(run.folder).verdicts}
     assert claims["gpu-thirty-times-faster"].measured == pytest.approx(10)
     assert claims["gpu-step-constant-in-longest-baseline"].measured == pytest.approx(1)
     with np.load(run.folder / "figures" / "runtime-rows.npz", allow_pickle=False) as arrays:
@@ -173,6 +173,6 @@ def test_mistakes_are_sentences(change, sentence):
 def test_the_small_scale_runs(tmp_path):
     places = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
     run = run_study(load_study(FILE, "small", places), Budget(workers=1))
-    claims = {claim.name: claim for claim in evaluate_folder(run.folder).claims}
+    claims = {claim.name: claim for claim in evaluate_folder(run.folder).verdicts}
     assert 0 < claims["sum-dominates-step"].measured < 1
     assert claims["default-solve-in-minutes"].verdict != "not evaluated"
