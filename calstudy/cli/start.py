@@ -10,7 +10,7 @@ import math
 import re
 from pathlib import Path
 from string import Template
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -43,22 +43,24 @@ def init(
     With --data it is one of measured data: calibration, power spectra, and signal loss by injection.
     """
     from calstudy.base.package_files import published
+    from calstudy.experiment.model import STUDY_NAME
     from calstudy.studies.reference import SCHEMA_FILE
 
     if listed:
         _list_examples()
         return
     path = Path(f"{name}.yaml")
-    schema_file = published("experiments") / SCHEMA_FILE
     if example is not None and data is not None:
         raise InputError("--example and --data: choose one")
+    if not STUDY_NAME.fullmatch(name):
+        raise InputError(f"{name!r} cannot name an experiment: use at most 64 letters, digits, '_', '.', '-'")
     if data is not None:
-        text = observed_text(name, schema_file, beam, **_described(data))
+        text = _filled("observed", name=name, beam=beam, **_described(data))
     else:
-        text = starter_text(name, schema_file) if example is None else copy_text(example, name, schema_file)
+        text = _filled("starter", name=name) if example is None else _copy(example, name)
     if path.exists():
         raise InputError(f"{path}: exists already, and is not overwritten; choose another name or remove it")
-    path.write_text(text, encoding="utf-8")
+    path.write_text(f"{MODELINE}{published('experiments') / SCHEMA_FILE}\n{text}", encoding="utf-8")
     typer.echo(f"{path}: next, `calstudy plan {path}`")
 
 
@@ -76,7 +78,7 @@ def _list_examples() -> None:
     Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False), numbers=False)
 
 
-def _described(data: str) -> dict[str, Any]:
+def _described(data: str) -> dict[str, str]:
     """Return entries of a file on measured data, after a look at their metadata."""
     from calstudy.realdata.halves import read_facts
     from calstudy.realdata.interference import has_surroundings
@@ -95,8 +97,8 @@ def _described(data: str) -> dict[str, Any]:
         f"integrations, in {facts.unit!r}.",
         "first": f"{first / 1e3:.3f} MHz",
         "last": f"{last / 1e3:.3f} MHz",
-        "in_jansky": facts.unit.lower() == "jy",
-        "searchable": has_surroundings(facts.times.size, facts.frequencies.size),
+        "scale": "# " + SCALE if facts.unit.lower() == "jy" else SCALE,
+        "search": "" if has_surroundings(facts.times.size, facts.frequencies.size) else "# ",
     }
 
 
@@ -117,51 +119,21 @@ def write_schema(path: Path) -> None:
     typer.echo(f"{path}")
 
 
-def observed_text(name: str, schema: Path, beam: str, in_jansky: bool, searchable: bool, **entries: str) -> str:
-    """Return the text of a file about measured data; see `starter_text`.
-
-    `beam` is the name of a beam, `in_jansky` is true for data in Jy, and `searchable` for those that are enough for a
-    search for interference. The entries are ``path`` as it is written, ``summary``, a sentence, and ``first`` and
-    ``last``, the ends of the band.
-    """
-    _require_name(name)
-    optional = {"scale": "# " + SCALE if in_jansky else SCALE, "search": "" if searchable else "# "}
-    return f"{MODELINE}{schema}\n" + _filled("observed", name=name, beam=beam, **optional, **entries)
-
-
-def starter_text(name: str, schema: Path) -> str:
-    """Return the text of an experiment file with the path of the JSON schema, for editors.
-
-    Raises InputError if the name is not allowed.
-    """
-    _require_name(name)
-    return f"{MODELINE}{schema}\n" + _filled("starter", name=name)
-
-
-def copy_text(example: str, name: str, schema: Path) -> str:
-    """Return the text of a published experiment under another name; see `starter_text`."""
+def _copy(example: str, name: str) -> str:
+    """Return the text of a published experiment under another name."""
     from calstudy.base.package_files import find_experiment
     from calstudy.experiment.files import read_mapping
 
-    _require_name(name)
     path = find_experiment(Path(example))
     content = read_mapping(path)
     if "experiments" in content or isinstance(content.get("experiment"), str):
         raise InputError(f"--example {example}: is made of other files; copy one of those")
     lines = path.read_text(encoding="utf-8").splitlines()
     kept = [line for line in lines if not line.startswith(MODELINE)]
-    text = re.sub(r"^name: .*$", f"name: {name}", "\n".join(kept), count=1, flags=re.MULTILINE)
-    return f"{MODELINE}{schema}\n{text}\n"
+    return re.sub(r"^name: .*$", f"name: {name}", "\n".join(kept), count=1, flags=re.MULTILINE) + "\n"
 
 
 def _filled(template: str, **entries: str) -> str:
     """Return the text of a file beside this module, with entries in place of their names."""
     text = Path(__file__).with_name(f"{template}.yaml").read_text(encoding="utf-8")
     return Template(text).substitute(entries)
-
-
-def _require_name(name: str) -> None:
-    from calstudy.experiment.model import STUDY_NAME
-
-    if not STUDY_NAME.fullmatch(name):
-        raise InputError(f"{name!r} cannot name an experiment: use at most 64 letters, digits, '_', '.', '-'")
