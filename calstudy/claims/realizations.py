@@ -12,6 +12,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.instrument.layouts import make_array, redundant_groups
 from calstudy.power.realizations import Design, mean_over_bins
+from calstudy.products.files import read_arrays
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
@@ -36,8 +37,7 @@ class PooledResults:
     @classmethod
     def of(cls, experiment: Experiment, folder: Path) -> PooledResults:
         """Read the arrays from the folder of the figure."""
-        with np.load(folder / ARRAYS, allow_pickle=False) as arrays:
-            return cls(experiment, dict(arrays))
+        return cls(experiment, read_arrays(folder / ARRAYS))
 
     @property
     def name(self) -> str:

@@ -33,6 +33,7 @@ from calstudy.products.files import (
     MODEL,
     SOLUTION,
     integration_times,
+    read_arrays,
     read_json,
     read_visibilities,
     write_json,
@@ -129,8 +130,6 @@ class _Solution:
     @property
     def lengths(self) -> np.ndarray:
         """Lengths of the baselines of each integration, m, (Ntimes Nbls,)."""
-        import numpy as np
-
         return np.resize(np.linalg.norm(self.vectors, axis=1), len(self.model))
 
     def axes(self, modes: DelayModes) -> dict[str, Any]:
@@ -256,16 +255,13 @@ class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(0.1, di
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T and C in bands, crossed between the realizations as T by injection is, or null if not known."""
-        with (
-            np.load(self.even / AMPLITUDES, allow_pickle=False) as even,
-            np.load(self.odd / AMPLITUDES, allow_pickle=False) as odd,
-        ):
-            if not even.files or not odd.files:
-                write_json(output / RESPONSE, {"bands": None})
-                return {}
-            where = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
-            answers = even["left"], odd["left"]
-            transfer, cross = bin_response(where, even["signal"], answers, BANDS, self.power.wedge_buffer)
+        even, odd = (read_arrays(folder / AMPLITUDES) for folder in (self.even, self.odd))
+        if not even or not odd:
+            write_json(output / RESPONSE, {"bands": None})
+            return {}
+        where = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
+        answers = even["left"], odd["left"]
+        transfer, cross = bin_response(where, even["signal"], answers, BANDS, self.power.wedge_buffer)
         bands = [
             {"transfer": json_number(left), "cross_transfer": json_number(crossed)}
             for left, crossed in zip(transfer, cross, strict=True)

@@ -86,6 +86,12 @@ def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
     uvd.write_uvh5(path, data_write_dtype=np.dtype(np.complex64 if single else np.complex128))
 
 
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an npz file."""
+    with np.load(path, allow_pickle=False) as file:
+        return dict(file)
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))

@@ -23,7 +23,7 @@ from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
 from calstudy.products import calibration, corruption, observed
 from calstudy.products.calibration import Calibrated, prepared_fit, read_result
-from calstudy.products.files import GAINS, write_json
+from calstudy.products.files import GAINS, read_arrays, write_json
 from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
@@ -312,5 +312,4 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=3):
 
 def read_coverage(folder: Path) -> GainCoverage:
     """Read the fractions of all solves."""
-    with np.load(folder / COVERAGE, allow_pickle=False) as arrays:
-        return GainCoverage(**arrays)
+    return GainCoverage(**read_arrays(folder / COVERAGE))

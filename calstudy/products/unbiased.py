@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
 from calstudy.experiment.model import Experiment
+from calstudy.instrument.layouts import redundant_groups
+from calstudy.power.binned import make_bin_edges
 from calstudy.power.settings import PowerSettings
+from calstudy.power.spectra import SphericalSpectrum
+from calstudy.power.tables import load_spectrum, save_spectrum
+from calstudy.power.windows import BinSignals, UnbiasedSpectrum, deconvolved, window_matrix
 from calstudy.products import corruption, signal_loss
 from calstudy.products.expected_loss import (
     AMPLITUDES,
@@ -19,16 +27,11 @@ from calstudy.products.expected_loss import (
     solved_inputs,
     why_no_response,
 )
-from calstudy.products.files import read_json, spectrum_file
+from calstudy.products.files import read_arrays, read_json, spectrum_file
 from calstudy.products.graph import Graph, memoize, required
 from calstudy.products.signal_loss import SCALE
 from calstudy.products.spectra import spectra
 from calstudy.run.task import Input, Task
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
 
 UNBIASED = "unbiased.h5"
 FURTHEST = 0.6
@@ -64,12 +67,8 @@ class BinResponse(Solved, stage="bin-response", version=1):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the amplitudes of what is left of the signals; none if there are no gains."""
-        import numpy as np
-
         from calstudy.calibrate.expected_loss import DelayModes
         from calstudy.calibrate.expected_loss import linear_response as response_to
-        from calstudy.instrument.layouts import redundant_groups
-        from calstudy.power.windows import BinSignals
 
         solution, arrays = self.solution(), {}
         if solution is not None:
@@ -109,22 +108,13 @@ class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectrum with its window functions; raises InputError if the integration has no gains."""
-        import numpy as np
-
-        from calstudy.power.spectra import SphericalSpectrum
-        from calstudy.power.tables import load_spectrum, save_spectrum
-        from calstudy.power.windows import UnbiasedSpectrum, deconvolved, window_matrix
-
         edges = window_edges(self.power)
-        with (
-            np.load(self.even / AMPLITUDES, allow_pickle=False) as even,
-            np.load(self.odd / AMPLITUDES, allow_pickle=False) as odd,
-        ):
-            if not even.files or not odd.files:
-                raise InputError("unbiased: the middle integration has antennas or channels without gains")
-            modes = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
-            both = even["left"], odd["left"]
-            window = window_matrix(modes, both, even["put_in"], edges, self.power.wedge_buffer)
+        even, odd = (read_arrays(folder / AMPLITUDES) for folder in (self.even, self.odd))
+        if not even or not odd:
+            raise InputError("unbiased: the middle integration has antennas or channels without gains")
+        modes = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
+        both = even["left"], odd["left"]
+        window = window_matrix(modes, both, even["put_in"], edges, self.power.wedge_buffer)
         residual, signal = (
             load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
             for name in ("residual", "eor")
@@ -141,7 +131,5 @@ class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
 
 def window_edges(power: PowerSettings) -> np.ndarray:
     """Return the edges of the bins of k that have window functions, h/Mpc."""
-    from calstudy.power.binned import make_bin_edges
-
     edges = make_bin_edges(power.bins)
     return edges[: max(int(edges.searchsorted(FURTHEST, side="right")), 2)]

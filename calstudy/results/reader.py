@@ -43,6 +43,7 @@ from calstudy.products.files import (
     SKY_MODEL_ERROR,
     TRANSFER,
     TRANSFER_BANDS,
+    read_arrays,
     read_json,
     spectrum_file,
 )
@@ -343,7 +344,7 @@ class RunFolder:
     def arrays(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the arrays of all figures, by figure and name."""
         try:
-            return {path.stem: _read_arrays(path) for path in sorted(self.figures.glob("*.npz"))}
+            return {path.stem: read_arrays(path) for path in sorted(self.figures.glob("*.npz"))}
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{self.path}: its figures cannot be read ({error})") from None
 
@@ -388,11 +389,6 @@ class RunFolder:
             return verdicts_from_json(path.read_text(encoding="utf-8"))
         except (OSError, ValueError, TypeError, KeyError):
             raise InputError(f"{path}: is damaged; {remedy}") from None
-
-
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
 
 
 def find_runs(folder: Path) -> list[RunFolder]:
