@@ -21,7 +21,7 @@ from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
-from calstudy.base.resources import Usage, cores
+from calstudy.base.resources import Usage, cores, free_memory, parse_memory
 from calstudy.base.schema import plain
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
 from calstudy.run.store import Product, Store
@@ -209,18 +209,16 @@ BEGUN, WAITS = "begun", "waits"
 
 @dataclass(frozen=True)
 class Schedule:
-    """Tasks that a run must make, and products that exist already.
+    """Tasks that a run must make.
 
     Attributes
     ----------
     todo : tasks to make, every one after its inputs
-    ready : intact products that the run needs, by key
     damaged : tasks whose product is damaged; they are in `todo`
     again : keys of intact products of other code that are made again; their tasks are in `todo`
     """
 
     todo: tuple[Task, ...]
-    ready: dict[str, Product]
     damaged: tuple[Task, ...]
     again: frozenset[str]
 
@@ -241,6 +239,11 @@ class Budget:
     max_memory: str | None = None
     scheduler: str | None = None
     strict: bool = False
+
+    @property
+    def memory(self) -> float:
+        """Memory of all workers together, bytes."""
+        return free_memory() if self.max_memory is None else parse_memory(self.max_memory)
 
 
 @dataclass(frozen=True)
@@ -285,15 +288,15 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
         other = of_other_code(tasks, found_of(tasks, store))
     again: set[str] = set()
     todo: dict[str, Task] = {}
-    ready: dict[str, Product] = {}
+    intact: set[str] = set()
     damaged: list[Task] = []
 
     def visit(task: Task) -> None:
-        if task.key in todo or task.key in ready or task.key in given:
+        if task.key in todo or task.key in intact or task.key in given:
             return
         product = store.verify(task.stage.name, task.key)
         if product is not None and task.key not in other:
-            ready[task.key] = product
+            intact.add(task.key)
             return
         if product is not None:
             again.add(task.key)
@@ -305,7 +308,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
 
     for task in (*targets, *without_record(targets, store)):
         visit(task)
-    return Schedule(tuple(todo.values()), ready, tuple(damaged), frozenset(again))
+    return Schedule(tuple(todo.values()), tuple(damaged), frozenset(again))
 
 
 def _write_errors_to(path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
-from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, free_memory, parse_memory, total_memory
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, total_memory
 from calstudy.calibrate.interface import Calibrator
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.instrument.layouts import size_of_instrument
@@ -58,7 +58,8 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
     _require_sane(budget)
     if scheduler is not None:
         return file, workers or 1
-    memory = _memory(budget)
+    # The parent process has the libraries in memory, too.
+    memory = budget.memory - LIBRARIES_MEMORY
     hoped = workers or cores()
     lean = _stream(_cut(_Work(file, targets, budget.strict), memory / hoped), memory / hoped)
     return lean.file, _workers(lean.missing, memory, hoped, budget)
@@ -71,20 +72,13 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
     """
     if budget.scheduler is not None:
         return
-    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
     samples = size_of_instrument(experiment.instrument).samples
     need = samples * COMPLEX128
-    if need > ABSURD * memory:
+    if need > ABSURD * budget.memory:
         raise InputError(
             f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are "
-            f"{memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
+            f"{budget.memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
         )
-
-
-def _memory(budget: Budget) -> float:
-    """Return the memory for work, in bytes; the parent process has the libraries in memory, too."""
-    memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
-    return memory - LIBRARIES_MEMORY
 
 
 def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget) -> int:

@@ -13,6 +13,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.products import corruption, simulation
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.graph import Graph
+from calstudy.run import execution
 from calstudy.run.store import Store
 from calstudy.run.task import Task
 from calstudy.studies import capacity
@@ -111,21 +112,21 @@ def test_what_cannot_fit_is_refused_in_one_sentence(paper):
 
 
 def test_free_memory_is_the_default(paper, monkeypatch):
-    monkeypatch.setattr(capacity, "free_memory", lambda: 1.5e9)
+    monkeypatch.setattr(execution, "free_memory", lambda: 1.5e9)
     with pytest.raises(InputError, match=r"this machine has 0\.7 GB"):
         fit(paper, None, None)
-    monkeypatch.setattr(capacity, "free_memory", lambda: 200e9)
+    monkeypatch.setattr(execution, "free_memory", lambda: 200e9)
     monkeypatch.setattr(capacity, "cores", lambda: 5)
     assert fit(paper, None, None)[1] == 5
 
 
 def test_workers_asked_for_without_a_limit_are_given(paper, monkeypatch):
-    monkeypatch.setattr(capacity, "free_memory", lambda: 6e9)
+    monkeypatch.setattr(execution, "free_memory", lambda: 6e9)
     assert fit(paper, 16, None)[1] == 16
 
 
 def test_a_cluster_is_taken_as_it_is(paper, monkeypatch):
-    monkeypatch.setattr(capacity, "free_memory", lambda: 1)
+    monkeypatch.setattr(execution, "free_memory", lambda: 1)
     assert fit(paper, None, None, "tcp://somewhere:8786") == (paper, 1)
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.quiet import require_tensorflow
-from calstudy.base.resources import free_memory, parse_memory
 from calstudy.base.schema import Section, fault
 from calstudy.base.units import Length
 from calstudy.calibrate.settings import BasisSettings
@@ -29,25 +28,22 @@ from calstudy.run.task import Task
 from calstudy.studies.study import Study
 
 
-def _require_increasing(sizes: Sequence[float]) -> None:
+def _increasing(sizes: tuple[float, ...]) -> tuple[float, ...]:
     if list(sizes) != sorted(set(sizes)):
         raise fault("", f"must increase, and name no size twice: {', '.join(f'{size:g}' for size in sizes)}")
+    return sizes
 
 
 class RowsOfEight(Section):
     """Rows of eight antennas, as far apart as the longest baseline allows (paper Fig. ANTPOS_RUNTIME)."""
 
     antennas: Annotated[
-        tuple[Annotated[int, Field(ge=9)], ...], Field(strict=False, min_length=3, description="Sizes, increasing.")
+        tuple[Annotated[int, Field(ge=9)], ...],
+        Field(strict=False, min_length=3, description="Sizes, increasing."),
+        AfterValidator(_increasing),
     ] = (16, 24, 32, 48, 64, 96, 128)
     spacing: Length = Field(2.0, gt=0, description="Distance between neighbours in a row.")
     max_baseline: Length = Field(100.0, gt=0)
-
-    @field_validator("antennas")
-    @classmethod
-    def _increasing(cls, sizes: tuple[int, ...]) -> tuple[int, ...]:
-        _require_increasing(sizes)
-        return sizes
 
     @model_validator(mode="after")
     def _rows_fit(self) -> RowsOfEight:
@@ -64,14 +60,9 @@ class Line(Section):
     lengths: Annotated[
         tuple[Annotated[Length, Field(gt=0)], ...],
         Field(strict=False, min_length=3, description="Longest baselines, increasing."),
+        AfterValidator(_increasing),
     ] = (20.0, 35.0, 50.0, 75.0, 100.0, 150.0, 200.0)
     count: int = Field(10, ge=3, description="Antennas of each.")
-
-    @field_validator("lengths")
-    @classmethod
-    def _increasing(cls, sizes: tuple[float, ...]) -> tuple[float, ...]:
-        _require_increasing(sizes)
-        return sizes
 
 
 class SampleCounts(Section):
@@ -179,12 +170,11 @@ class RuntimeStudy(Study):
             raise InputError(
                 "--workers and --scheduler: run times are measured on this machine, one after the other; leave both out"
             )
-        memory = free_memory() if budget.max_memory is None else parse_memory(budget.max_memory)
         largest = max(self.timings.values(), key=lambda task: task.cost.memory)
-        if largest.cost.memory > memory:
+        if largest.cost.memory > budget.memory:
             raise InputError(
                 f"run times of {largest.label}: the paper's solver needs about {largest.cost.memory / 1e9:.1f} GB, "
-                f"and there are {memory / 1e9:.1f} GB; name smaller arrays, or fewer channels"
+                f"and there are {budget.memory / 1e9:.1f} GB; name smaller arrays, or fewer channels"
             )
         return self, 1
 
