@@ -36,7 +36,7 @@ from calstudy.power.spectra import (
     DelaySpectra,
     SphericalSpectrum,
     bins_of_k,
-    bins_of_length,
+    length_bins,
     outside_wedge,
 )
 
@@ -223,10 +223,10 @@ def spherical_average(
 
 def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: bool = True) -> CylindricalSpectrum:
     """Average over baselines of similar length with equal weights for all pairs; `folded` averages +-tau as well."""
-    bins, index = np.unique(bins_of_length(spectra.length, settings.length_bin), return_inverse=True)
-    power = np.zeros((bins.size, spectra.delay.size), dtype=complex)
+    edges, index = length_bins(spectra.length, settings.length_bin)
+    power = np.zeros((len(edges), spectra.delay.size), dtype=complex)
     np.add.at(power, index, spectra.n_pairs[:, None] * spectra.power)
-    n_pairs = np.zeros(bins.size, dtype=int)
+    n_pairs = np.zeros(len(edges), dtype=int)
     np.add.at(n_pairs, index, spectra.n_pairs)
     length = np.bincount(index, spectra.n_pairs * spectra.length) / n_pairs
     power /= n_pairs[:, None]
@@ -235,7 +235,7 @@ def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: 
         delay, k_parallel, power = _fold(delay, k_parallel, power)
     return CylindricalSpectrum(
         baseline_length=length,
-        bin_edges=np.column_stack([bins, bins + 1]) * settings.length_bin,
+        bin_edges=edges,
         k_perp=np.bincount(index, spectra.n_pairs * spectra.k_perp) / n_pairs,
         delay=delay,
         k_parallel=k_parallel,

@@ -38,24 +38,23 @@ def delays(n_channels: int, channel_width: float) -> np.ndarray:
     return np.fft.fftshift(np.fft.fftfreq(n_channels, d=channel_width))
 
 
-def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: str, axis: int = -1) -> np.ndarray:
+def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: str) -> np.ndarray:
     """Transform visibilities from frequency to delay.
 
     V~(tau) = dnu sum_nu exp(2 pi i tau nu) V(nu) T(nu) (paper, third equation of §Reduction of Simulation Products).
-    Raises ValueError if the frequencies do not match the axis or are not equally spaced, or the taper is unknown.
+    Raises ValueError if the frequencies do not match the last axis or are not equally spaced, or the taper is unknown.
 
     Parameters
     ----------
-    visibilities : complex, any shape with frequency along `axis`, in Jy
+    visibilities : complex, any shape with frequency along the last axis, in Jy
     frequencies : equally spaced ascending channel centres in Hz, shape (Nfreqs,)
     taper : name of the taper, see `TAPERS`
-    axis : the frequency axis, replaced by delay in the order of `delays`
 
     Returns
     -------
-    Complex array of the same shape, in Jy Hz.
+    Complex array of the same shape in Jy Hz, with delay in the order of `delays` along the last axis.
     """
-    visibilities = np.moveaxis(np.asarray(visibilities), axis, -1)
+    visibilities = np.asarray(visibilities)
     n_channels = frequencies.size
     if visibilities.shape[-1] != n_channels:
         raise ValueError(f"visibilities have {visibilities.shape[-1]} channels, frequencies {n_channels}")
@@ -63,7 +62,7 @@ def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: st
     transform = np.fft.ifft(visibilities * make_taper(taper, n_channels), axis=-1) * (n_channels * width)
     transform = np.fft.fftshift(transform, axes=-1)
     transform *= np.exp(2j * np.pi * delays(n_channels, width) * frequencies[0])
-    return np.moveaxis(transform, -1, axis)
+    return transform
 
 
 def channel_width(frequencies: np.ndarray) -> float:

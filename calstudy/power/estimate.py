@@ -167,8 +167,6 @@ class DiagonalPSpecData(PSpecData):
 
 logger = logging.getLogger(__name__)
 
-POWER_UNIT = "mK2 h-3 Mpc3"
-"""Unit of every power spectrum of this package."""
 
 HERA_TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "none"}
 

@@ -332,20 +332,18 @@ def inside_bars(deviations: np.ndarray, errors: np.ndarray) -> np.ndarray:
     return np.where(known, np.abs(deviations) <= SIGMAS_95 * errors, np.nan)
 
 
-def coverage(inside: np.ndarray, independent: bool) -> Finding:
+def coverage(inside: np.ndarray) -> Finding:
     """Return the part of 95 % bars that cover, and its uncertainty, from `inside_bars`, (K, Nk).
 
     The uncertainty is the larger of the one from the scatter over realizations, which includes correlated bins, and the
-    binomial one for 95 % of independent bins. `independent` is true if the quantity that the bars should cover is drawn
-    in every realization; otherwise the realizations repeat the same trials, and only the bins of one realization count.
+    binomial one for 95 % of independent bins. The quantity that the bars should cover is drawn in every realization.
     """
     known = np.isfinite(inside)
     if not known.any():
         return Finding(np.nan, np.nan)
     each = np.array([row[used].mean() for row, used in zip(inside, known, strict=True) if used.any()])
-    trials = known.sum() if independent else known.sum(axis=1).max()
-    binomial = float(np.sqrt(0.95 * 0.05 / trials))
-    by_scatter = float(each.std(ddof=1) / np.sqrt(each.size)) if independent and each.size > 1 else 0.0
+    binomial = float(np.sqrt(0.95 * 0.05 / known.sum()))
+    by_scatter = float(each.std(ddof=1) / np.sqrt(each.size)) if each.size > 1 else 0.0
     return Finding(float(inside[known].mean()), max(binomial, by_scatter))
 
 

@@ -141,9 +141,8 @@ def difference(
     flux_scales : s of both; NaN if not known
     """
     limits = np.asarray(edges, dtype=float)
-    names = [item.name for item in fields(CalibratedSpectra)]
     common = of_common_units(
-        {f"{name} {place}": getattr(one, name) for place, one in enumerate(calibrations) for name in names}
+        {f"{name} {place}": getattr(one, name) for place, one in enumerate(calibrations) for name in SPECTRA}
     )
     clusters = clusters_in_k(common["signal 0"], limits, buffer, inside=False)
     sums = {name: clusters.powers(one) for name, one in common.items()}

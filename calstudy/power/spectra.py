@@ -211,12 +211,13 @@ def bins_of_k(modes: DelaySpectra | BaselineModes, edges: np.ndarray) -> np.ndar
     return bins
 
 
-def bins_of_length(lengths: np.ndarray, width: float) -> np.ndarray:
-    """Return the bin of each baseline length, int, from zero; both lengths and the width of the bins are in m.
+def length_bins(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges (N, 2) of the bins that have baselines, and the bin of each; lengths and the width are in m.
 
     A length that is the edge of two bins but for rounding is in the upper one, so that equal lengths share a bin.
     """
-    return np.floor((lengths + SAME_LENGTH) / width).astype(int)
+    found, index = np.unique(np.floor((lengths + SAME_LENGTH) / width).astype(int), return_inverse=True)
+    return np.column_stack([found, found + 1]) * width, index
 
 
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:

@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, bins_of_length, outside_wedge
+from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, outside_wedge
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -304,14 +304,14 @@ def _squared_coherence(signal: Sums, response: Sums, cross: Sums) -> tuple[np.nd
 def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap:
     """Return T in bins of baseline length, `length_bin` m wide, and delay."""
     signal = injection.signal
-    lengths, row = np.unique(bins_of_length(signal.length, length_bin), return_inverse=True)
+    length_edges, row = length_bins(signal.length, length_bin)
     spacing = signal.delay[1] - signal.delay[0]
     step = np.rint(signal.delay / spacing).astype(int)
     column = np.abs(step)
-    shape = (lengths.size, column.max() + 1)
+    shape = (len(length_edges), column.max() + 1)
     bins = row[:, None] * shape[1] + column
     samples = 2 * np.arange(row.size)[:, None] + (step < 0)
-    clusters = Clusters.of(signal, bins, samples, lengths.size * shape[1])
+    clusters = Clusters.of(signal, bins, samples, shape[0] * shape[1])
     of_signal = clusters.powers(signal)
     transfer, cross_transfer = (
         clusters.powers(part).ratio(of_signal) for part in (injection.response, injection.cross)
@@ -320,7 +320,7 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
     length = np.bincount(row, signal.n_pairs * signal.length) / pairs
     return TransferMap(
         baseline_length=length,
-        bin_edges=np.column_stack([lengths, lengths + 1]) * length_bin,
+        bin_edges=length_edges,
         k_perp=np.bincount(row, signal.n_pairs * signal.k_perp) / pairs,
         delay=spacing * np.arange(shape[1]),
         k_parallel=np.bincount(column, np.abs(signal.k_parallel)) / np.bincount(column),
@@ -430,18 +430,18 @@ def bin_expected(
     total = np.bincount(bins[used], transfer[used], limits.size - 1)
     square = np.bincount(bins[used], error[used] ** 2, limits.size - 1)
     filled = np.where(count > 0, count, np.nan)
-    rows, row = np.unique(bins_of_length(modes.length, length_bin), return_inverse=True)
+    length_edges, row = length_bins(modes.length, length_bin)
     spacing = modes.delay[1] - modes.delay[0]
     column = np.abs(np.rint(modes.delay / spacing).astype(int))
     cell = (row[:, None] * (column.max() + 1) + column)[known]
-    shape = (rows.size, column.max() + 1)
+    shape = (len(length_edges), column.max() + 1)
     members, sums = (np.bincount(cell, weights, shape[0] * shape[1]) for weights in (None, transfer[known]))
     return ExpectedBins(
         k=(limits[1:] + limits[:-1]) / 2,
         bin_edges=limits,
         outside=total / filled,
         outside_error=np.sqrt(square) / filled,
-        length_edges=np.column_stack([rows, rows + 1]) * length_bin,
+        length_edges=length_edges,
         delay=spacing * np.arange(shape[1]),
         by_length=(sums / np.where(members > 0, members, np.nan)).reshape(shape),
     )

@@ -239,7 +239,7 @@ class RegionResults:
     def coverage(self, kind: str, bins: np.ndarray) -> Finding | None:
         """Return the coverage in some bins over the block with independent trials; None without such a block."""
         trials = self.trials(kind)
-        return None if trials is None else coverage(trials[:, bins], independent=True)
+        return None if trials is None else coverage(trials[:, bins])
 
     def trials(self, kind: str) -> np.ndarray | None:
         """Return which realizations of the block with independent trials cover, (K, Nk); None without such a block."""

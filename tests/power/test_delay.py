@@ -23,14 +23,14 @@ def test_transform_is_the_sum_of_the_paper(n, taper, first, seed):
     np.testing.assert_allclose(d.delay_transform(data, frequencies, taper), expected, rtol=0, atol=1e-6 * 80e3 * n)
 
 
-def test_a_source_appears_at_its_delay_along_any_axis():
+def test_a_source_appears_at_its_delay():
     frequencies = 180e6 + 80e3 * np.arange(64)
     tau = d.delays(64, 80e3)[40]
-    data = np.exp(-2j * np.pi * tau * frequencies)[:, None] * np.ones(2)
-    transform = d.delay_transform(data, frequencies, "none", axis=0)
-    assert transform.shape == (64, 2)
-    np.testing.assert_allclose(transform[40], 64 * 80e3, rtol=1e-6)
-    assert np.abs(np.delete(transform, 40, axis=0)).max() < 1e-5 * 64 * 80e3
+    data = np.exp(-2j * np.pi * tau * frequencies) * np.ones((2, 1))
+    transform = d.delay_transform(data, frequencies, "none")
+    assert transform.shape == (2, 64)
+    np.testing.assert_allclose(transform[:, 40], 64 * 80e3, rtol=1e-6)
+    assert np.abs(np.delete(transform, 40, axis=1)).max() < 1e-5 * 64 * 80e3
 
 
 @pytest.mark.parametrize("taper", sorted(d.TAPERS))

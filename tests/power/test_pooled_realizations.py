@@ -138,7 +138,7 @@ def test_right_error_bars_cover_what_they_should(design, random):
             pulls = pooled.values[f"pull_{kind}"]
             place = design.block_of("noise" if kind == "eor" else "eor")
             rows = pulls[list(design.blocks[place][1])]
-            found[kind].append(coverage(inside_bars(rows, np.ones(rows.shape)), independent=True)[:2])
+            found[kind].append(coverage(inside_bars(rows, np.ones(rows.shape)))[:2])
     values = {kind: np.array(items) for kind, items in found.items()}
     spread = np.sqrt(0.95 * 0.05 / (60 * 6 * BINS))
     assert values["eor"][:, 0].mean() == pytest.approx(0.95, abs=5 * spread)
@@ -150,11 +150,8 @@ def test_right_error_bars_cover_what_they_should(design, random):
 def test_the_uncertainty_of_coverage_knows_of_correlated_bins(random):
     """Bins that all move together are one trial: the scatter over realizations says so, the binomial does not."""
     pulls = np.repeat(random.standard_normal((40, 1)), BINS, axis=1)
-    found = coverage(inside_bars(pulls, np.ones(pulls.shape)), independent=True)
+    found = coverage(inside_bars(pulls, np.ones(pulls.shape)))
     assert found.uncertainty > 2 * np.sqrt(0.95 * 0.05 / pulls.size)
-    same = np.repeat(random.standard_normal((1, BINS)), 40, axis=0)
-    repeated = coverage(inside_bars(same, np.ones(same.shape)), independent=False)
-    assert repeated.uncertainty == pytest.approx(np.sqrt(0.95 * 0.05 / BINS))
 
 
 def test_errors_that_are_too_small_are_found_out(random):
