@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
-from uuid import uuid4
 
 import numpy as np
 import yaml
@@ -16,6 +14,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import replacing
 from calstudy.base.table import Table
 from calstudy.experiment.model import FIGURES
 from calstudy.results.reader import EXPERIMENT, MANIFEST, NO_RUN, RunFolder
@@ -132,19 +131,13 @@ def accept(run: Path, reference: Path) -> None:
         for old in kept:
             if old.relative_to(reference).as_posix() not in contents:
                 old.unlink(missing_ok=True)
-        for name, content in contents.items():
-            _replace(reference / name, content)
-        _replace(reference / EXPERIMENT, description.encode())
+        for name, content in (*contents.items(), (EXPERIMENT, description.encode())):
+            with replacing(reference / name) as stream:
+                stream.write(content)
         if not listed:
             (reference / "tables").rmdir()
     except OSError as error:
         raise InputError(f"{reference}: cannot be written ({error.strerror})") from None
-
-
-def _replace(path: Path, content: bytes) -> None:
-    partial = path.with_name(f".{path.name}-{uuid4().hex}")
-    partial.write_bytes(content)
-    shutil.move(partial, path)
 
 
 def _experiment(run: Path) -> dict[str, Any]:

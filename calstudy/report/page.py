@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import yaml
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import replacing
 from calstudy.base.paths import leaves
 from calstudy.base.table import Table
 from calstudy.report.headline import Number, read_headline, read_signal
@@ -371,12 +371,11 @@ def write_report(folder: Path) -> Path:
 
 def write_page(page: str, path: Path) -> Path:
     """Write a page, completely or not at all, and return its path; raises InputError if it cannot be written."""
-    partial = path.with_name(f".{path.name}-{uuid4().hex}")
     try:
-        partial.write_text(page, encoding="utf-8")
+        with replacing(path) as stream:
+            stream.write(page.encode())
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-    partial.replace(path)
     return path
 
 
