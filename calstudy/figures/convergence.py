@@ -16,6 +16,7 @@ from calstudy.calibrate.settings import GainFit, GainWeights
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
+from calstudy.products.agreement import spread
 from calstudy.products.convergence import PATHS, followed
 from calstudy.products.files import read_json
 from calstudy.products.graph import Graph
@@ -134,9 +135,9 @@ class Convergence(StudyFigure):
         return reason
 
     def _integrations(self, graph: Graph) -> list[int]:
-        last = graph.experiment.instrument.times.count - 1
-        count = min(graph.experiment.outputs.convergence.integrations, last + 1)
-        return np.unique(np.linspace(0, last, count).round().astype(int)).tolist()
+        experiment = graph.experiment
+        every = np.arange(experiment.instrument.times.count)
+        return spread(every, experiment.outputs.convergence.integrations).tolist()
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return every solver on every integration of data with the EoR and without."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,20 +14,20 @@ from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
 from calstudy.figures.spherical import Marking, draw_points, magnitudes
 from calstudy.figures.wedge import draw_wedge
 from calstudy.plotting import style
-from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
-from calstudy.power.tables import load_spectrum
-from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
-from calstudy.products.files import EXPECTED, spectrum_file
-from calstudy.products.files import TRANSFER as FILE
 from calstudy.products.graph import MeasuredGraph, required
 from calstudy.products.observed_injection import expected_loss, transfer
 from calstudy.products.observed_results import observed_spectra
+from calstudy.products.signal_loss import REGIONS
+from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from calstudy.power.spectra import SphericalSpectrum
+    from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 
 
 MARKINGS = {
@@ -97,11 +97,8 @@ class ObservedSpherical(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw a column for each choice of modes."""
-        folder = job.inputs["spectra"]
-        columns = {
-            modes: {name: load_spectrum(folder / spectrum_file(name, modes), SphericalSpectrum) for name in MARKINGS}
-            for modes in COLUMNS
-        }
+        tables = Tables((job.inputs["spectra"],))
+        columns = {modes: {name: tables.spherical(name, modes) for name in MARKINGS} for modes in COLUMNS}
         figure = draw_observed(columns, job.settings["wedge_buffer"])
         return Drawing(figure, {modes.replace("-", "_"): series for modes, series in columns.items()})
 
@@ -133,8 +130,8 @@ class ObservedWedge(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each spectrum."""
-        folder = job.inputs["spectra"]
-        found = {name: load_spectrum(folder / spectrum_file(name, "wedge"), CylindricalSpectrum) for name in TITLES}
+        tables = Tables((job.inputs["spectra"],))
+        found = {name: tables.wedge(name) for name in TITLES}
         figure = draw_wedge(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY)
         return Drawing(figure, found)
 
@@ -200,15 +197,8 @@ class ObservedSignalLoss(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw T per k and per (|b|, tau)."""
-        folder, prediction = job.inputs["transfer"], None
-        if "expected" in job.inputs:
-            prediction = load_spectrum(job.inputs["expected"] / EXPECTED, ExpectedBins)
-        outside, inside = (
-            load_spectrum(folder / spectrum_file(FILE, part), TransferFunction)
-            for part in ("outside-wedge", "inside-wedge")
-        )
-        by_length = load_spectrum(folder / spectrum_file(FILE, "wedge"), TransferMap)
-        loss = ObservedLoss(outside, inside, by_length, prediction)
-        figure = draw_observed_loss(loss, job.settings["wedge_buffer"])
-        shown: dict[str, Any] = {"outside": outside, "inside": inside, "map": by_length}
-        return Drawing(figure, shown if prediction is None else {**shown, "expected": prediction})
+        tables = Tables(tuple(job.inputs.values()))
+        outside, inside = (tables.transfer(region) for region in REGIONS)
+        expected = tables.expected_transfer if "expected" in job.inputs else None
+        loss = ObservedLoss(outside, inside, tables.transfer_map(), expected)
+        return Drawing(draw_observed_loss(loss, job.settings["wedge_buffer"]), loss)

@@ -157,10 +157,6 @@ class Sweep(StudyFigure):
         return Drawing(draw_sweep(panels), {"panels": panels})
 
 
-def _bands(folder: Path) -> TransferFunction:
-    return Tables((folder,)).transfer_in_bands("outside-wedge")
-
-
 def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> Any:
     """Return one block as a panel: a category per combination of values, with its EoR skies pooled."""
     fields = list(block[0]["changes"])
@@ -169,7 +165,8 @@ def _panel(block: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]) -> A
     groups: dict[tuple[str, ...], list[TransferFunction]] = {}
     for point in block:
         category = tuple(point["changes"][field] for field in shown)
-        groups.setdefault(category, []).append(_bands(folders[point["label"]]))
+        tables = Tables((folders[point["label"]],))
+        groups.setdefault(category, []).append(tables.transfer_in_bands("outside-wedge"))
     names = short_names(fields)
     fixed = [f"{names[field]} {block[0]['changes'][field]}" for field in fields if field not in varied]
     skies = max(len(found) for found in groups.values())
