@@ -38,7 +38,7 @@ from typing import ClassVar
 import numpy as np
 
 from calstudy.base.table import Table
-from calstudy.base.visibilities import to_cube
+from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.claims.bins import recovered, used_bins
 from calstudy.experiment.model import Variant
 from calstudy.instrument.beams import make_beam
@@ -240,12 +240,9 @@ def _before_calibration(run: StepInput) -> list[DelaySpectra]:
     """Return the EoR's spectra without taper: one integration, the plain average, the fringe-stopped average."""
     data = read_visibilities(run.products["data"] / DATA)
     stopped, cube = fringe_stop_and_average(data), to_cube(data)
-    plain = stopped.copy()
-    versions = []
-    for values in (cube[len(cube) // 2], cube.mean(axis=0)):
-        version = plain.copy()
-        version.data_array = values.astype(complex)
-        versions.append(version)
+    versions = [
+        from_cube(stopped, values[None].astype(complex)) for values in (cube[len(cube) // 2], cube.mean(axis=0))
+    ]
     settings = run.experiment.power.model_copy(update={"taper": "none"})
     instrument = run.experiment.instrument
     beam = make_beam(instrument.beam, instrument.channels)

@@ -142,16 +142,17 @@ PAIRS = "pspec.h5"
 """File with the spectra of all pairs of baselines, which the estimator of hera_pspec stores with its product."""
 
 
+EOR_ALONE: dict[str, Any] = {
+    "corruption.eor_level": None,
+    "sky.foregrounds": "none",
+    "variants": {"eor": {"components": ["eor"]}},
+    "outputs.figures": [],
+}
+
+
 def _sky(seed: int) -> Case:
     """Return another sky; its spectrum is white, so that pixels may be larger."""
-    alone = {"corruption.eor_level": None, "sky.foregrounds": "none", "variants": {"eor": {"components": ["eor"]}}}
-    changes: dict[str, Any] = {
-        "sky.eor.seed": seed,
-        "sky.eor.nside": 64,
-        "simulation.chunks": 4,
-        **alone,
-        "outputs.figures": [],
-    }
+    changes = {"sky.eor.seed": seed, "sky.eor.nside": 64, "simulation.chunks": 4, **EOR_ALONE}
     return Case("minredundant.yaml", changes, {"sky.eor.seed": seed})
 
 
@@ -264,16 +265,7 @@ POWER_LAW = {"sky.eor.spectrum": "power-law", "sky.eor.index": -2.0}
 # Maps of nside 128 resolve baselines up to 80 m, more than half of the 630. The sampling error of one sky is 0.4 %.
 STEEP = Case(
     "minredundant.yaml",
-    {
-        **POWER_LAW,
-        "sky.eor.nside": 128,
-        "sky.eor.seed": 2,
-        "simulation.chunks": 2,
-        "corruption.eor_level": None,
-        "sky.foregrounds": "none",
-        "variants": {"eor": {"components": ["eor"]}},
-        "outputs.figures": [],
-    },
+    {**POWER_LAW, "sky.eor.nside": 128, "sky.eor.seed": 2, "simulation.chunks": 2, **EOR_ALONE},
     {**POWER_LAW, "sky.eor.nside": 64},
 )
 

@@ -41,7 +41,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
-from calstudy.calibrate.basis import dpss_vectors, make_basis
+from calstudy.calibrate.basis import ForegroundBasis, dpss_vectors, make_basis
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.problem import FitStructure, gain_products, make_structure
 from calstudy.calibrate.records import CalibrationResult
@@ -112,9 +112,13 @@ class SingleIntegration:
     @property
     def modelled(self) -> np.ndarray:
         """The projection of the foregrounds on the basis of the fit, (Nbls, Nfreqs), which can be fitted exactly."""
+        return self.projected(self.structure.basis)
+
+    def projected(self, basis: ForegroundBasis) -> np.ndarray:
+        """Return the projection of the foregrounds on a basis, (Nbls, Nfreqs)."""
         cube = to_cube(self.foregrounds)[0, :, :, 0]
         projected = np.empty_like(cube)
-        for bucket in self.structure.basis.buckets:
+        for bucket in basis.buckets:
             projected[bucket.members] = cube[bucket.members] @ bucket.vectors @ bucket.vectors.T
         return projected
 
@@ -293,11 +297,7 @@ def narrow_model(integration: SingleIntegration) -> np.ndarray:
     """Return the foregrounds in the basis without its buffer, (Nbls, Nfreqs)."""
     settings = integration.settings.basis.model_copy(update={"buffer": 0.0})
     lengths = np.linalg.norm(baseline_vectors(integration.foregrounds), axis=1)
-    cube = to_cube(integration.foregrounds)[0, :, :, 0]
-    projected = np.empty_like(cube)
-    for bucket in make_basis(lengths, integration.foregrounds.freq_array, settings).buckets:
-        projected[bucket.members] = cube[bucket.members] @ bucket.vectors @ bucket.vectors.T
-    return projected
+    return integration.projected(make_basis(lengths, integration.foregrounds.freq_array, settings))
 
 
 def best_misfit(integration: SingleIntegration, visibilities: np.ndarray, gains: np.ndarray) -> np.ndarray:
