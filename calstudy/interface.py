@@ -207,20 +207,8 @@ class CalibratedData:
         return "\n".join([f"calibrated data in {self.folder}", f"solves: {counts}", *warned])
 
 
-class StudyPlan(Mapping[str, Any]):
+class StudyPlan(dict[str, Any]):
     """The products and the cost of a run as plain values; it is printed as a table."""
-
-    def __init__(self, content: Mapping[str, Any]) -> None:
-        self._content = dict(content)
-
-    def __getitem__(self, name: str) -> Any:
-        return self._content[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._content)
-
-    def __len__(self) -> int:
-        return len(self._content)
 
     @property
     def stages(self) -> pandas.DataFrame:
@@ -230,7 +218,7 @@ class StudyPlan(Mapping[str, Any]):
         return pandas.DataFrame(self["stages"]).set_index("stage")
 
     def __repr__(self) -> str:
-        return _printed(lambda console: show_plan(self._content, console))
+        return _printed(lambda console: show_plan(self, console))
 
 
 class LoadedStudy:

@@ -106,14 +106,6 @@ class Parts:
         times = self.facts[part].times
         return times[PARITIES.index(part) :: 2] if self.interleaved else times
 
-    @property
-    def centre(self) -> float | None:
-        """Julian date at which the phase centre of both is at the zenith; None for the middle of each half."""
-        if not self.interleaved:
-            return None
-        times = self.facts["even"].times
-        return float((times.min() + times.max()) / 2)
-
     def averaging(self, power: PowerSettings) -> dict[str, Any]:
         """Return the averaging of a half: the phase centre, or the number of blocks, their span and the kept ones.
 
@@ -128,7 +120,8 @@ class Parts:
         even = self.facts["even"]
         count = power.n_blocks(even.duration, even.integration)
         if count == 1:
-            return {"centre": self.centre}
+            # Both halves have the same phase centre at the zenith, or each that of its own middle.
+            return {"centre": float((even.times.min() + even.times.max()) / 2) if self.interleaved else None}
         if self.interleaved and (power.coherent_time or 0) < 2 * even.integration:
             raise InputError(
                 f"power.coherent_time = {power.coherent_time:g} s: a block must hold two integrations, "

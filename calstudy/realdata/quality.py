@@ -251,7 +251,9 @@ def held_out(data: UVData, prediction: UVData) -> tuple[float, int]:
             continue
         own = _stopped(_at(data, [time]), time)
         moved = [_stopped(_at(prediction, [other]), time) for other in (before[-1], after[0])]
-        mean = from_cube(_at_rows(own, antenna_pairs(prediction)), (to_cube(moved[0]) + to_cube(moved[1])) / 2)
+        rows = rows_of(own, antenna_pairs(prediction))
+        template = own.select(blt_inds=rows, inplace=False, run_check=False)
+        mean = from_cube(template, (to_cube(moved[0]) + to_cube(moved[1])) / 2)
         mean.flag_array = moved[0].flag_array | moved[1].flag_array
         found, samples = chi_squared(own, mean)
         total, count = total + found, count + samples
@@ -260,10 +262,6 @@ def held_out(data: UVData, prediction: UVData) -> tuple[float, int]:
 
 def _at(data: UVData, times: list[float]) -> UVData:
     return data.select(blt_inds=np.flatnonzero(np.isin(data.time_array, times)), inplace=False, run_check=False)
-
-
-def _at_rows(data: UVData, pairs: np.ndarray) -> UVData:
-    return data.select(blt_inds=rows_of(data, pairs), inplace=False, run_check=False)
 
 
 def _stopped(data: UVData, time: float) -> UVData:

@@ -99,9 +99,6 @@ def select(data: UVData, selection: Selection) -> UVData:
     chosen: dict[str, Any] = {}
     if selection.antennas is not None:
         chosen["antenna_nums"] = [_antenna(data, antenna) for antenna in selection.antennas]
-    if selection.lengths is not None:
-        low, high = selection.lengths
-        chosen["bl_lengths"] = low, high
     if selection.times is not None:
         times = np.unique(data.time_array)
         chosen["times"] = times[_within(np.arange(times.size), selection.times, 0, "times", "integrations")]
@@ -111,9 +108,8 @@ def select(data: UVData, selection: Selection) -> UVData:
         )
     if selection.polarizations is not None:
         chosen["polarizations"] = [_polarization(data, name) for name in selection.polarizations]
-    lengths = chosen.pop("bl_lengths", None)
-    if lengths is not None:
-        chosen["blt_inds"] = np.flatnonzero(_of_length(data, lengths, selection.autos))
+    if selection.lengths is not None:
+        chosen["blt_inds"] = np.flatnonzero(_of_length(data, selection.lengths, selection.autos))
     if not chosen:
         return data
     try:
