@@ -85,12 +85,10 @@ class Difference:
 
     Attributes
     ----------
-    bin_edges : (Nk + 1,), h/Mpc
     transfer, transfer_error : T s^2 of the first less that of the second, and its standard deviation, (Nk,)
     bias, bias_error : the same of s^2 P^R0 / P^S
     """
 
-    bin_edges: np.ndarray
     transfer: np.ndarray
     transfer_error: np.ndarray
     bias: np.ndarray
@@ -158,4 +156,4 @@ def difference(
                 signals.append((-value / signal.total, signal))
             values.append(value)
         found += [values[0] + values[1], linear_error((*powers, *signals))]
-    return Difference(limits, *found)
+    return Difference(*found)

@@ -9,7 +9,7 @@ import base64
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -173,7 +173,7 @@ class Contents:
     headline: Sequence[Number] = ()
     answers: Sequence[str] = ()
     files: Sequence[str] = ()
-    parts: Sequence[tuple[str, str]] = field(default=())
+    parts: Sequence[tuple[str, str]] = ()
     experiment: str = ""
 
 
