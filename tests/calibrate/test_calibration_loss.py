@@ -51,7 +51,7 @@ def numpy_loss(problem, gains, coefficients):
 
 
 def tensor_problem(problem, gains, coefficients, precision):
-    kernels = adamax.JointKernels(problem.structure, 0.01, precision, "sum")
+    kernels = adamax.JointKernels(problem.structure, precision, "sum")
     measured, exact = (kernels.tensors.load(problem, dtype) for dtype in (kernels.dtype, tf.float64))
     target = pairs.to_pair(np.array(problem.prior_target / measured.scale), kernels.dtype)
     data = FitData(measured.visibilities, measured.weights, target, kernels.loss.summed(exact.weights))

@@ -213,7 +213,7 @@ def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Paramet
 
 
 def update(
-    learning_rate: float,
+    learning_rate: float | tf.Tensor,
     step: tf.Tensor,
     parameters: Parameters,
     moments: tuple[Parameters, Parameters],
@@ -221,22 +221,21 @@ def update(
 ) -> tuple[Parameters, tuple[Parameters, Parameters]]:
     """Take a step, counted from one in the dtype of the parameters; return parameters and moments."""
     first = _map(lambda m, g: BETA_1 * m + (1 - BETA_1) * g, moments[0], gradient)
-    rate = tf.constant(learning_rate, step.dtype) / (1 - tf.cast(BETA_1, step.dtype) ** step)
+    rate = tf.cast(learning_rate, step.dtype) / (1 - tf.cast(BETA_1, step.dtype) ** step)
     second = _map(lambda n, g: tf.maximum(BETA_2 * n, tf.abs(g)), moments[1], gradient)
     moved = _map(lambda x, m, n: x - rate * m / (n + EPSILON), parameters, first, second)
     return moved, (first, second)
 
 
 class JointKernels:
-    """Loss, gradient and the compiled descent for one fit structure and one learning rate."""
+    """Loss, gradient and the compiled descent for one fit structure."""
 
-    def __init__(self, structure: FitStructure, learning_rate: float, precision: Precision, prior: Prior) -> None:
+    def __init__(self, structure: FitStructure, precision: Precision, prior: Prior) -> None:
         self.dtype = tf.float32 if precision == "single" else tf.float64
         self.tensors = FitTensors(structure)
         self.projector = Projector(structure, self.tensors)
         self.space = GainSpace(structure.gain_vectors, self.dtype)
         self.loss = JointLoss(self.tensors, self.space, prior, self.dtype)
-        self._learning_rate = learning_rate
         self.descend = tf.function(self._descend, jit_compile=True, autograph=False)
 
     def load(self, problem: CalibrationProblem, gains: np.ndarray) -> tuple[Parameters, FitData, float]:
@@ -262,7 +261,7 @@ class JointKernels:
         return pairs.to_complex(self.space.expand(parameters.gains)), self.tensors.unload([model], scale)
 
     def _descend(
-        self, n_steps: tf.Tensor, done: tf.Tensor, descent: Descent, data: FitData
+        self, n_steps: tf.Tensor, done: tf.Tensor, learning_rate: tf.Tensor, descent: Descent, data: FitData
     ) -> tuple[Descent, tf.Tensor, tf.Tensor]:
         """Take `n_steps` steps after `done`; return the descent, the loss before each step, and the loss after all."""
 
@@ -271,7 +270,7 @@ class JointKernels:
             better = value < now.best_loss
             best = _map(lambda new, old: tf.where(better, new, old), now.parameters, now.best)
             step = tf.cast(done + index + 1, self.dtype)
-            moved = update(self._learning_rate, step, now.parameters, now.moments, gradient)
+            moved = update(learning_rate, step, now.parameters, now.moments, gradient)
             descent = Descent(*moved, best, tf.where(better, value, now.best_loss))
             return index + 1, descent, tf.tensor_scatter_nd_update(losses, [[index]], [value])
 
@@ -281,9 +280,9 @@ class JointKernels:
 
 
 @lru_cache(maxsize=4)
-def compiled(structure: FitStructure, learning_rate: float, precision: Precision, prior: Prior) -> JointKernels:
-    """Return the kernels of a structure and setting, compiled once for all its integrations."""
-    return JointKernels(structure, learning_rate, precision, prior)
+def compiled(structure: FitStructure, precision: Precision, prior: Prior) -> JointKernels:
+    """Return the kernels of a structure and setting, compiled once for all its integrations and learning rates."""
+    return JointKernels(structure, precision, prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +323,7 @@ class Adamax:
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> AdamaxState:
         """Start from the first gains and their best-fitting foregrounds, in weighted least squares."""
-        kernels = compiled(problem.structure, self.learning_rate, self.precision, problem.prior)
+        kernels = compiled(problem.structure, self.precision, problem.prior)
         gains = problem.initial_gains if warm is None else warm.gains
         parameters, data, scale = kernels.load(problem, gains)
         loss = kernels.loss.value(parameters, data)
@@ -343,8 +342,8 @@ class Adamax:
 
     def _steps(self, state: AdamaxState, n_steps: int) -> AdamaxState:
         done = len(state.history) - 1
-        counts = tf.constant(n_steps), tf.constant(done)
-        descent, losses, final = state.kernels.descend(*counts, state.descent, state.data)
+        settings = tf.constant(n_steps), tf.constant(done), tf.constant(self.learning_rate, state.kernels.dtype)
+        descent, losses, final = state.kernels.descend(*settings, state.descent, state.data)
         if final < descent.best_loss:
             descent = descent._replace(best=descent.parameters, best_loss=final)
         history = (*state.history, *losses.numpy()[1:n_steps].astype(float), float(final))
