@@ -2,8 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import lru_cache
+
 import pytest
 from toy import HEX, Toy, make_toy, scattered
+
+from calstudy.calibrate.solvers import reduced
+
+
+@pytest.fixture(autouse=True, scope="session")
+def kept_kernels() -> Iterator[None]:
+    """Keep more compiled kernels than studies do: the arrays below come again between dozens of others."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reduced, "_kernels", lru_cache(maxsize=32)(reduced._kernels.__wrapped__))
+        yield
 
 
 @pytest.fixture(scope="session")

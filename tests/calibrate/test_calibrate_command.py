@@ -157,14 +157,14 @@ def test_the_size_of_the_errors_of_the_sky_model_is_told(command, finished, data
     assert 5 < float(found) < 20
 
 
-def test_the_log_tells_every_solve(command, data, tmp_path):
-    command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
-    log = json.loads((tmp_path / "out" / "solution.json").read_text())
-    assert log["by_status"] == {"converged": 1}
-    (record,) = log["records"]
-    assert len(record["loss_history"]) == record["n_steps"] + 1
-    assert record["seconds"] > 0
-    assert record["peak_memory"] > 1e8
+def test_the_log_tells_every_solve(finished):
+    log = json.loads((finished[0] / "out" / "solution.json").read_text())
+    assert log["by_status"] == {"converged": 2}
+    assert [record["integration"] for record in log["records"]] == [0, 1]
+    for record in log["records"]:
+        assert len(record["loss_history"]) == record["n_steps"] + 1
+        assert record["seconds"] > 0
+        assert record["peak_memory"] > 1e8
     assert log["settings"]["basis"]["buffer"].startswith("5e-08")
     assert log["settings"]["prior"] == "gains"
 
@@ -177,9 +177,9 @@ def test_results_are_never_overwritten_unasked(command, data, tmp_path):
     assert code == 2
     assert error == "calstudy: --output out: holds gains.calh5 already; use --overwrite or another folder\n"
     assert (folder / "gains.calh5").read_text() == "precious"
-    assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
+    assert command(data, *OPTIONS, "--output", "out", "--overwrite", "--select", "times=0..0")[0] == 0
     assert {path.name for path in folder.iterdir()} == WRITTEN
-    assert UVCal.from_file(str(folder / "gains.calh5")).Ntimes == 2
+    assert UVCal.from_file(str(folder / "gains.calh5")).Ntimes == 1
 
 
 @pytest.mark.parametrize("name", ["gains.h5", "gains.fits", "gains.bin", "gains.calfits"])
@@ -194,11 +194,11 @@ def test_gains_of_other_formats_are_not_overwritten_either(command, data, tmp_pa
 def test_results_that_are_replaced_leave_none_of_the_earlier_calibration(command, data, finished, tmp_path):
     shutil.copytree(finished[0] / "out", tmp_path / "out")
     (tmp_path / "out" / "notes.txt").write_text("mine")
-    start = ["--gains", "out/gains.calfits"]
-    assert command(data, *OPTIONS, *start, "--output", "out", "--overwrite")[0] == 0
+    one, start = ["--select", "times=0..0"], ["--gains", "out/gains.calfits"]
+    assert command(data, *OPTIONS, *one, *start, "--output", "out", "--overwrite")[0] == 0
     # What it reads is kept.
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt", "gains.calfits"}
-    assert command(data, *OPTIONS, "--output", "out", "--overwrite")[0] == 0
+    assert command(data, *OPTIONS, *one, "--output", "out", "--overwrite")[0] == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt"}
 
 
@@ -303,13 +303,13 @@ def test_a_disk_that_is_full_is_told_in_a_sentence(command, data, monkeypatch):
 @pytest.mark.parametrize("text", ["prior: none\n", "calibration: {prior: none, solver: {max_steps: 7}}\n", "{}\n"])
 def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(command, data, tmp_path, text):
     (tmp_path / "settings.yaml").write_text(text)
-    options = ["--buffer", "50 ns", "--settings", "settings.yaml", "--set", "solver.tolerance=1e-4"]
-    command(data, *options, "--select", "times=0..0", "--output", "out")
+    options = ["--buffer", "50 ns", "--settings", "settings.yaml", "--set", "solver.tolerance=0.1"]
+    command(data, *options, "--select", "times=0..0", "--output", "out", "--no-gain-errors")
     found = json.loads((tmp_path / "out" / "solution.json").read_text())["settings"]
     usual = defaults(has_sky_model=False)
     assert found["prior"] == ("none" if "prior" in text else "gains")
     assert found["solver"]["max_steps"] == (7 if "solver" in text else usual["solver"]["max_steps"])
-    assert found["solver"]["tolerance"] == 1e-4
+    assert found["solver"]["tolerance"] == 0.1
 
 
 def test_python_calibrates_as_the_command_does(data, command, tmp_path, monkeypatch):
@@ -349,7 +349,7 @@ def test_gains_have_their_errors_beside_what_other_readers_see(command, finished
         assert summary["noise_from"] == "residual"
         assert 0 < summary["smooth_fraction"] < 1
         assert summary["median_signal_to_noise"] * summary["median_relative_amplitude"] == pytest.approx(1)
-    command(data, "--output", "smooth", *OPTIONS, "--set", "gain_delay=200 ns")
+    command(data, "--output", "smooth", *OPTIONS, "--set", "gain_delay=200 ns", "--select", "times=0..0")
     smooth = CalibratedData(tmp_path / "smooth")
     assert "restricted to smooth functions" in smooth.solution["records"][0]["gain_errors"]["reason"]
     with pytest.raises(InputError, match="has no errors of gains"):
@@ -377,7 +377,7 @@ def test_an_antenna_that_cannot_be_calibrated_is_flagged_with_its_number(command
     for written in (found.model, found.residual):
         assert np.array_equal(written.flag_array.all(axis=(1, 2)), dead)
     assert not found.residual.data_array[dead].any()
-    command(data, *options, "--output", "plain", "--no-gain-errors")
+    command(data, *options, "--output", "plain", "--no-gain-errors", "--select", "times=0..0")
     assert not CalibratedData(tmp_path / "plain").gains.flag_array.all(axis=(1, 2, 3)).any()
 
 

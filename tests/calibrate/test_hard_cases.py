@@ -117,8 +117,8 @@ EASIER_OR_LARGER = {
     "3 km, 500 ns",
 }
 """With shorter cables than cases of the same array, or more data: left to ``pytest -m slow``."""
-QUICK = {"six antennas, 300 ns", "flagged antenna, 300 ns"}
-"""In the default suite; the others are left to ``pytest -m chain``."""
+QUICK = {"six antennas, 300 ns"}
+"""In the default suite; all others are left to ``pytest -m chain``."""
 
 
 def marks(name):

@@ -52,6 +52,7 @@ def test_a_member_without_a_panel_beside_it_leaves_no_empty_axes():
     assert sum(axes.get_visible() for axes in figure.axes) == 8
 
 
+@pytest.mark.chain
 def test_a_run_of_a_known_sky_is_covered(tmp_path):
     data = tiny(tmp_path)
     for path, value in {

@@ -41,8 +41,16 @@ STAND_INS = ("synthetic faint sources, " * 5 + "all of them.", "small scale")
 
 
 @pytest.fixture(scope="module")
-def plain(draw_all) -> dict[str, Figure]:
-    return draw_all()
+def drawn(draw_all) -> tuple[dict[str, Figure], list[dict[str, object]]]:
+    """All figures, and matplotlib's settings before and after they are drawn."""
+    settings = [dict(matplotlib.rcParams)]
+    figures = draw_all()
+    return figures, [*settings, dict(matplotlib.rcParams)]
+
+
+@pytest.fixture(scope="module")
+def plain(drawn) -> dict[str, Figure]:
+    return drawn[0]
 
 
 @pytest.fixture(scope="module")
@@ -85,10 +93,9 @@ def test_stand_ins_are_printed_below_everything_and_only_when_there_are_any(plai
         assert not [text for text in plain[name].findobj(Text) if "stand-in" in text.get_text()]
 
 
-def test_no_setting_and_no_pyplot_figure_is_left_behind(draw_all):
-    before = dict(matplotlib.rcParams)
-    draw_all()
-    assert dict(matplotlib.rcParams) == before
+def test_no_setting_and_no_pyplot_figure_is_left_behind(drawn):
+    _, (before, after) = drawn
+    assert after == before
     assert plt.get_fignums() == []
 
 

@@ -40,7 +40,7 @@ WIDE = {"kind": "gaussian", "fwhm_deg": 30.0}
 
 @pytest.fixture(scope="module")
 def template():
-    return observe(count=6, channels=2, times=1)
+    return observe(count=6, channels=1, times=1)
 
 
 @pytest.fixture(scope="module")

@@ -57,8 +57,10 @@ def make_here(folder: Path, *tasks: Task) -> RunProducts:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("assumed")
+def folder(tmp_path_factory, shared_store) -> Path:
+    folder = tmp_path_factory.mktemp("assumed")
+    (folder / "store").symlink_to(shared_store)
+    return folder
 
 
 def gains_of(folder: Path, **assumed: object) -> np.ndarray:
