@@ -287,6 +287,11 @@ def test_structures_are_compiled_once_for_the_same_content(toy):
     assert compiled(same, False) is compiled(toy.structure)
 
 
+def test_adamax_is_compiled_once_for_all_learning_rates(toy):
+    slow, fast = (Adamax(learning_rate=rate).init(toy.problem()).kernels for rate in (1e-3, 1e-2))
+    assert slow is fast
+
+
 def test_bad_problems_are_refused_in_one_sentence(toy):
     with pytest.raises(ValueError, match="weights"):
         toy.problem(weights=-np.ones(toy.foregrounds.shape))
