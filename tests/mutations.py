@@ -237,8 +237,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a missing conjugate in the fit",
-        "gains[antennas[:, 0]] * gains[antennas[:, 1]].conj()",
-        "gains[antennas[:, 0]] * gains[antennas[:, 1]]",
+        "gains[..., first, :] * gains[..., second, :].conj()",
+        "gains[..., first, :] * gains[..., second, :]",
         FITS,
     ),
     Mutation(
