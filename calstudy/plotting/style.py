@@ -41,7 +41,7 @@ BAND = "#C9C9C9"
 SERIES = (("o", BLUE), ("s", ORANGE), ("D", GREEN), ("^", MAGENTA), ("v", RED))
 """Marker and colour of several series of points."""
 OPEN_MARKER: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": GREY, "markersize": 4}
-"""What stands for negative points in a legend."""
+"""The entry of a legend for negative points, which are drawn open."""
 
 FREQUENCY = "frequency (MHz)"
 DELAY = "delay (ns)"

@@ -288,8 +288,6 @@ def test_priors_are_followed_where_single_precision_misses_their_curvature(hexag
     problem = wide_prior(hexagon, "both", 0.05, 0.1, noise=1e-4)
     found = solve(problem, GaussNewton(tolerance=1e-5)).record
     assert found.status == "converged", found.message
-    # It takes 28 steps.
-    assert found.steps < 60
     # chi^2 of complex samples, each with a mean of one, less what gains and foregrounds follow.
     assert found.loss_history[-1] < problem.visibilities.size
 

@@ -129,8 +129,8 @@ class GaussNewtonState:
         return self.kernels.dampings.remembered and self.channel_steps == 0 and self.beyond_single
 
     @property
-    def hides(self) -> bool:
-        """Whether the damping may hide directions that matter, so that convergence is checked with less of it."""
+    def needs_check(self) -> bool:
+        """Whether convergence is checked with less damping, because the damping may hide directions that matter."""
         in_double = self.kernels.dampings.remembered and self.kernels.dtype == tf.float64
         return self.beyond_single or (in_double and not self.curved)
 
@@ -202,7 +202,7 @@ class GaussNewton:
         settled = self._settled(state)
         if self._goes_on(state) and (settled or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
-        if settled and state.hides:
+        if settled and state.needs_check:
             return replace(state, predicted=self._checked(state).predicted, checked=True)
         kernels = state.kernels
         state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
@@ -241,7 +241,7 @@ class GaussNewton:
         if loss < self._rounding:
             return Solve("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if self._settled(state) and (state.checked or not (state.hides or state.curved)):
+        if self._settled(state) and (state.checked or not (state.needs_check or state.curved)):
             return Solve("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.checked and self.precision == "single":
             return Solve(
