@@ -10,8 +10,8 @@ used throughout.
 With a finite prior the damping is smaller. It then stays raised after a step that did not lower the loss, and falls
 again as steps achieve their predicted decrease. Directions that foregrounds can nearly follow have a curvature from the
 prior alone. Products in single precision miss it by factors, so that steps along these directions are too short, and
-some hundred follow each other. Once single precision does not resolve the damping, such fits continue in double
-precision.
+some hundred follow each other. Where single precision does not resolve the damping, and the decrease of the loss hardly
+shrinks from step to step, such fits continue in double precision.
 
 Smooth gains that foregrounds can nearly follow have eigenvalues of any size down to rounding, and a damping hides all
 that are smaller. They matter where the noise is far below the foregrounds. Once the loss is so small that single
@@ -64,6 +64,8 @@ POOR_STEP, GOOD_STEP = 0.25, 0.75
 # Relative decrease of the loss that may be predicted in directions that single precision does not resolve: small arrays
 # with little noise often stop some parts in a thousand above the minimum.
 UNRESOLVED_DECREASE = 1e-2
+# Decrease of the loss that is predicted for the next step, relative to that of the last, of slow convergence.
+SLOW = 0.3
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
 
@@ -125,8 +127,9 @@ class GaussNewtonState:
 
     @property
     def decided_by_prior(self) -> bool:
-        """Whether a finite prior determines directions that single precision does not resolve."""
-        return self.kernels.dampings.remembered and self.channel_steps == 0 and self.beyond_single
+        """Whether a finite prior determines directions along which single precision is slow, or finds no lower loss."""
+        slow = self.boost > 1 or (math.isfinite(self.gained) and self.predicted > SLOW * self.gained)
+        return self.kernels.dampings.remembered and self.channel_steps == 0 and self.beyond_single and slow
 
     @property
     def needs_check(self) -> bool:
@@ -169,8 +172,8 @@ class GaussNewton:
     max_steps : maximum number of Gauss-Newton steps
     precision
         Precision of the inner products. Where single precision does not resolve the damping for the loss, ``double``
-        continues, and ``single`` is stalled if a larger decrease is possible. Fits with a finite prior continue in
-        double precision either way, with ``single`` down to the damping that is tied to the loss.
+        continues, and ``single`` is stalled if a larger decrease is possible. Fits with a finite prior that are slow
+        there continue in double precision either way, with ``single`` down to the damping that is tied to the loss.
     """
 
     tolerance: float = 1e-3
@@ -200,6 +203,8 @@ class GaussNewton:
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
         """Try one damped step, and accept it if it lowers the loss; or check whether another step is needed."""
         settled = self._settled(state)
+        if self.precision == "single" and state.decided_by_prior and not settled:
+            state = self._prepared(_in_double(state, thorough=False))
         if self._goes_on(state) and (settled or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
         if settled and state.needs_check:
@@ -348,8 +353,6 @@ class GaussNewton:
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Adapt the antenna blocks to the damping of the state, or compute them, and predict the next step."""
-        if self.precision == "single" and state.decided_by_prior:
-            state = _in_double(state, thorough=False)
         preconditioner = state.preconditioner
         kernels = state.kernels
         # Smooth gains couple all channels from the start.
