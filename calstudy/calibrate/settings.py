@@ -247,9 +247,9 @@ START_DEVIATION = 0.01
 class ForegroundPrior(Section):
     """Gaussian prior on deviations of the foregrounds from the assumed ones, flat over the modelled delays."""
 
-    # Finite priors are fitted in double precision since 2.
+    # Finite priors are fitted in double precision since 2, wherever many steps are needed since 3.
     mean: Literal["none", "sky-model"] = Field(
-        "none", description="What is assumed of the foregrounds.", json_schema_extra={REVISED: 2}
+        "none", description="What is assumed of the foregrounds.", json_schema_extra={REVISED: 3}
     )
     deviation: Deviation = Field(
         "infinite",

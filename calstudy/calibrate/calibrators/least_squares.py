@@ -125,7 +125,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
     # Fits whose preconditioner is singular in single precision converge since 4.
     # Directions that only the prior determines are fitted in double precision since 5.
-    version: ClassVar[int] = 5
+    # So are fits that need many steps since 6.
+    version: ClassVar[int] = 6
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -140,7 +141,8 @@ class Unified(_LeastSquares, ForegroundFit):
     # Weights are inverse variances since 3 where some samples have no weight and are not flagged.
     # Fits whose preconditioner is singular in single precision converge since 4.
     # Directions that only the prior determines are fitted in double precision since 5.
-    version: ClassVar[int] = 5
+    # So are fits that need many steps since 6.
+    version: ClassVar[int] = 6
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -154,7 +156,8 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
     # Only the last solve has the full tolerance since 2.
     # Fits whose preconditioner is singular in single precision converge since 3.
     # Directions that only the prior determines are fitted in double precision since 4.
-    version: ClassVar[int] = 4
+    # So are fits that need many steps since 5.
+    version: ClassVar[int] = 5
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"

@@ -64,8 +64,9 @@ POOR_STEP, GOOD_STEP = 0.25, 0.75
 # Relative decrease of the loss that may be predicted in directions that single precision does not resolve: small arrays
 # with little noise often stop some parts in a thousand above the minimum.
 UNRESOLVED_DECREASE = 1e-2
-# Decrease of the loss that is predicted for the next step, relative to that of the last, of slow convergence.
-SLOW = 0.3
+# Slow convergence in single precision: the decrease of the loss that is predicted for the next step, relative to that
+# of the last, or the number of steps.
+SLOW, PATIENCE = 0.3, 20
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
 
@@ -128,7 +129,8 @@ class GaussNewtonState:
     @property
     def decided_by_prior(self) -> bool:
         """Whether a finite prior determines directions along which single precision is slow, or finds no lower loss."""
-        slow = self.boost > 1 or (math.isfinite(self.gained) and self.predicted > SLOW * self.gained)
+        shrinks = not math.isfinite(self.gained) or self.predicted < SLOW * self.gained
+        slow = self.boost > 1 or not shrinks or len(self.history) > PATIENCE
         return self.kernels.dampings.remembered and self.channel_steps == 0 and self.beyond_single and slow
 
     @property
