@@ -13,8 +13,8 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import CasesFigure
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
-from calstudy.products.tolerances import SIGMAS, upper_limit
 from calstudy.run.task import Job
+from calstudy.verdicts.standing import SIGMAS, upper_limit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

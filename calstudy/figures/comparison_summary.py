@@ -14,10 +14,11 @@ from calstudy.base.table import number
 from calstudy.figures import CasesFigure
 from calstudy.figures.comparison import is_limit, look
 from calstudy.plotting import style
+from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.comparison import Case
-from calstudy.products.tolerances import BAND, LIMIT, Fault, faults, upper_limit
+from calstudy.products.tolerances import Fault, faults
 from calstudy.run.task import Job
-from calstudy.verdicts.standing import is_measured
+from calstudy.verdicts.standing import LIMIT, is_measured, upper_limit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -199,7 +200,7 @@ def draw_tolerances(
             positions = _positions(fault)
             axes.set_xticks(positions, [f"{severity:g}" for severity in fault.severities])
             axes.set_xticks([], minor=True)
-    band = rf"$k = {BAND[0]:g}$–${BAND[1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$"
+    band = rf"$k = {HEADLINE_BAND[0]:g}$–${HEADLINE_BAND[1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$"
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB of the foregrounds"
     grid[0, 0].set_title(band + level, loc="left")
     scored = {name for found in cases.values() for name in found}
@@ -221,7 +222,7 @@ def _draw_points(
     bands = [cases[world][calibrator].bands for world in fault.worlds if calibrator in cases[world]]
     if not bands:
         return
-    band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - BAND[0])))
+    band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - HEADLINE_BAND[0])))
     values, errors = (np.array([getattr(item, column)[band] for item in bands]) for column in (name, f"{name}_error"))
     axes.errorbar(
         _positions(fault)[there],

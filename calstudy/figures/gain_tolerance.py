@@ -20,8 +20,8 @@ from calstudy.products.comparison import case_name, read_cases
 from calstudy.products.gain_bias import gain_bias, read_gain_bias
 from calstudy.products.graph import required
 from calstudy.products.score import score
-from calstudy.products.tolerances import LIMIT, SIGMAS, upper_limit
 from calstudy.run.task import Job, Task
+from calstudy.verdicts.standing import LIMIT, SIGMAS, upper_limit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -30,6 +30,8 @@ from calstudy.power.spectra import DelaySpectra, of_common_units
 
 BANDS = (0.1, 0.2, 0.5, 1.0)
 """Edges in h/Mpc of the bands in which calibrations are compared."""
+HEADLINE_BAND = (0.2, 0.5)
+"""The band of headlines and tolerances: beyond the wedge of short baselines, where sensitivity is highest."""
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ import numpy as np
 from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
-from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score, difference
+from calstudy.power.score import BANDS, HEADLINE_BAND, SPECTRA, CalibratedSpectra, Score, difference
 from calstudy.power.tables import load_spectrum
 from calstudy.products import spectra
 from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, read_json
 from calstudy.products.graph import size_of
-from calstudy.products.tolerances import BAND, COUNTS, LIMIT, faults, tolerance, upper_limit
+from calstudy.products.tolerances import COUNTS, faults, tolerance
 from calstudy.run.task import Inputs, Task
-from calstudy.verdicts.standing import advice, is_measured, marked, standing_table, standings
+from calstudy.verdicts.standing import LIMIT, advice, is_measured, marked, standing_table, standings, upper_limit
 
 CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
@@ -264,7 +264,7 @@ def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
             if not bands:
                 cells.append("-")
                 continue
-            band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - BAND[0])))
+            band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - HEADLINE_BAND[0])))
             bias, error = (np.array([getattr(item, name)[band] for item in bands]) for name in ("bias", "bias_error"))
             found = tolerance([fault.severities[place] for place in there], bias, error)
             known = "" if found.relation == "=" else f"{found.relation} "
@@ -274,7 +274,7 @@ def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
         rows.append((fault.name, *cells))
     if not rows:
         return []
-    low, high = BAND
+    low, high = HEADLINE_BAND
     sentence = (
         f"Severity of each fault at which the bias reaches {LIMIT:g} of the EoR at k from {low:g} to {high:g} h/Mpc. "
         "Between two severities it is taken for a power law; `noise`: it cannot be told from the noise."

@@ -16,22 +16,12 @@ import numpy as np
 from astropy import units
 
 from calstudy.base.errors import InputError
-from calstudy.verdicts.standing import LIMIT, SIGMAS
+from calstudy.verdicts.standing import LIMIT, SIGMAS, upper_limit
 
-BAND = (0.2, 0.5)
-"""Band of k, h/Mpc, in which the bias is measured."""
 COUNTS = 1.0
 """A band of k counts if the upper limit of the bias is below this part of the EoR."""
 # A hyphen within a word is no sign, and a full stop within one no decimal point.
 _NUMBER = re.compile(r"(?:(?<!\S)[-+])?(?:\d+\.?\d*|(?<![^\s+-])\.\d+)(?:[eE][-+]?\d+)?")
-
-
-def upper_limit(bias: float, error: float) -> float:
-    """Return the 95 % upper limit of the size of a bias, from its standard deviation: |bias| + 2 sigma.
-
-    The measured bias is not reduced by its error: a bias of 1.9 standard deviations may as well be 3.9 as zero.
-    """
-    return abs(bias) + SIGMAS * error
 
 
 @dataclass(frozen=True)

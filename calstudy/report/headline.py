@@ -10,17 +10,16 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.table import two_digits
+from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.standing import marked, why_not_measured
 from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
-BAND = (0.2, 0.5)
-"""Wavenumbers of the headline, h/Mpc: beyond the wedge of short baselines, where sensitivity is highest."""
 MEASURED_BAND = (0.3, 0.5)
 """The same for measured data, whose T is in other bands."""
-PLACE = f"outside the wedge, k of {BAND[0]:g} to {BAND[1]:g} h/Mpc"
+PLACE = f"outside the wedge, k of {HEADLINE_BAND[0]:g} to {HEADLINE_BAND[1]:g} h/Mpc"
 SIGNIFICANT = 5.0
 """Standard deviations below which a bias may be noise."""
 
@@ -92,7 +91,7 @@ def read_signal(run: RunFolder) -> Signal | None:
         score = run.tables.score_in_bands
     except InputError:
         return None
-    band = int(np.argmin(np.abs(score.bin_edges[:-1] - BAND[0])))
+    band = int(np.argmin(np.abs(score.bin_edges[:-1] - HEADLINE_BAND[0])))
     bands = run.tables.summary["bands"] if run.tables.has(SCORE) else ()
     linear = next((entry.get("linear_transfer") for entry in bands if entry["k"][0] == score.bin_edges[band]), None)
     signal = Signal(

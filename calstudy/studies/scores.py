@@ -26,13 +26,13 @@ from calstudy.products.files import SCORE, read_json
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import MEASURED
 from calstudy.products.score import score as score_task
-from calstudy.products.tolerances import COUNTS, upper_limit
+from calstudy.products.tolerances import COUNTS
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store
 from calstudy.studies.folder import folder_of_runs, log_to
 from calstudy.studies.kinds.comparison import Comparison, WorldData
 from calstudy.studies.study import make
-from calstudy.verdicts.standing import LARGEST_ERROR, is_measured, standing_table, standings
+from calstudy.verdicts.standing import LARGEST_ERROR, is_measured, standing_table, standings, upper_limit
 
 LOG = "score.log"
 VERIFIED = "verified.txt"

@@ -10,7 +10,7 @@ from matplotlib.colors import same_color
 from calstudy.experiment.model import FIGURES
 from calstudy.figures.comparison_summary import draw_matrix
 from calstudy.plotting import style
-from calstudy.products.tolerances import upper_limit
+from calstudy.verdicts.standing import upper_limit
 
 
 def draw(cases):

@@ -8,7 +8,7 @@ import pytest
 from flat_scores import case
 
 from calstudy.figures.comparison import VARIANT_COLOURS, draw_variants, variants
-from calstudy.products.tolerances import upper_limit
+from calstudy.verdicts.standing import upper_limit
 
 
 def with_status(found, **by_status):

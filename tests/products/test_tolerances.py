@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from calstudy.base.errors import InputError
-from calstudy.products.tolerances import LIMIT, Tolerance, faults, tolerance
+from calstudy.products.tolerances import Tolerance, faults, tolerance
+from calstudy.verdicts.standing import LIMIT
 
 SEVERITIES = (0.0, 0.1, 1.0, 10.0)
 
