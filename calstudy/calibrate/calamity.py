@@ -32,6 +32,8 @@ SEARCH_TOLERANCE, NEAR = 1e-3, 0.1
 """Tolerance of the solves far from the most likely deviations, and the relative change of these that ends the search.
 
 Solves to this tolerance move on slowly, and deviations with them, so that these do not settle."""
+QUICK_PASSES = 3
+"""Passes after which single precision no longer has patience: its rounding may be all that weights still change by."""
 NO_EXACT_SOLVE = "only solves with the tolerance of the search for the deviation gave gains"
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 UNRESOLVED_DEVIATION = (
@@ -163,6 +165,7 @@ class _Passes:
     def __init__(self, settings: GainFit, solver: Solver, seed: tuple[int, int]) -> None:
         self._weights = settings.weights if isinstance(settings.weights, GainWeights) else None
         self._estimated, self._solver, self._seed = settings.estimates_deviation, solver, seed
+        self._late = replace(solver, patience=0) if isinstance(solver, GaussNewton) else solver
         exact = not self._estimated or solver.tolerance >= SEARCH_TOLERANCE
         self._search = solver if exact else make_solver(settings, SEARCH_TOLERANCE)
         passes = 0 if self._weights is None else self._weights.passes
@@ -184,7 +187,8 @@ class _Passes:
         change, anew, exact, searched = 0.0, True, self._search is self._solver, False
         while len(done) < self._most:
             exact = exact or len(done) == self._most - 1
-            solution, warm, anew = _solve(current, self._solver if exact else self._search, warm, anew)
+            solver = self._search if not exact else self._solver if len(done) < QUICK_PASSES else self._late
+            solution, warm, anew = _solve(current, solver, warm, anew)
             if done and not solution.record.usable:
                 return self._kept(done, change, found, NO_EXACT_SOLVE if searched else "")
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))

@@ -64,9 +64,8 @@ POOR_STEP, GOOD_STEP = 0.25, 0.75
 # Relative decrease of the loss that may be predicted in directions that single precision does not resolve: small arrays
 # with little noise often stop some parts in a thousand above the minimum.
 UNRESOLVED_DECREASE = 1e-2
-# Slow convergence in single precision: the decrease of the loss that is predicted for the next step, relative to that
-# of the last, or the number of steps.
-SLOW, PATIENCE = 0.3, 20
+# Decrease of the loss that is predicted for the next step, relative to that of the last, of slow convergence.
+SLOW = 0.3
 # Antenna blocks that need more iterations than this are out of date.
 CG_REFRESH = 15
 
@@ -126,11 +125,13 @@ class GaussNewtonState:
         kernels = self.kernels
         return kernels.dtype == tf.float32 and kernels.damping(self.history[-1]) <= kernels.dampings.least
 
-    @property
-    def decided_by_prior(self) -> bool:
-        """Whether a finite prior determines directions along which single precision is slow, or finds no lower loss."""
+    def decided_by_prior(self, patience: int) -> bool:
+        """Whether a finite prior determines directions along which single precision is slow, or finds no lower loss.
+
+        It counts as slow after `patience` steps as well.
+        """
         shrinks = not math.isfinite(self.gained) or self.predicted < SLOW * self.gained
-        slow = self.boost > 1 or not shrinks or len(self.history) > PATIENCE
+        slow = self.boost > 1 or not shrinks or len(self.history) > patience
         return self.kernels.dampings.remembered and self.channel_steps == 0 and self.beyond_single and slow
 
     @property
@@ -176,11 +177,15 @@ class GaussNewton:
         Precision of the inner products. Where single precision does not resolve the damping for the loss, ``double``
         continues, and ``single`` is stalled if a larger decrease is possible. Fits with a finite prior that are slow
         there continue in double precision either way, with ``single`` down to the damping that is tied to the loss.
+    patience
+        Number of steps after which a fit with a finite prior counts as slow; with zero it is in double precision
+        wherever single precision does not resolve the damping.
     """
 
     tolerance: float = 1e-3
     max_steps: int = 100
     precision: Literal["single", "double"] = "single"
+    patience: int = 20
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and reuse the preconditioner of the warm start."""
@@ -205,7 +210,7 @@ class GaussNewton:
     def step(self, state: GaussNewtonState) -> GaussNewtonState:
         """Try one damped step, and accept it if it lowers the loss; or check whether another step is needed."""
         settled = self._settled(state)
-        if self.precision == "single" and state.decided_by_prior and not settled:
+        if self.precision == "single" and state.decided_by_prior(self.patience) and not settled:
             state = self._prepared(_in_double(state, thorough=False))
         if self._goes_on(state) and (settled or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
