@@ -300,5 +300,7 @@ def test_a_file_about_measured_data_is_valid_and_names_their_band(here, capsys, 
     content = parse_yaml((here / "mine.yaml").read_text(), "mine")
     assert [error.message for error in schema.iter_errors(content)] == []
     assert content["observed"]["select"]["frequencies"] == "137.500 MHz..162.403 MHz"
+    # The file has autocorrelations; weights of gains that are lost in noise would run away.
+    assert content["calibration"]["weights"] == "autos"
     study = load_study(here / "mine.yaml")
     assert study.graph.parts.facts["even"].frequencies.size == 256

@@ -98,6 +98,7 @@ def _described(data: str) -> dict[str, str]:
         "first": f"{first / 1e3:.3f} MHz",
         "last": f"{last / 1e3:.3f} MHz",
         "scale": "# " + SCALE if facts.unit.lower() == "jy" else SCALE,
+        "autos": "" if facts.autos else "# ",
         "search": "" if has_surroundings(facts.times.size, facts.frequencies.size) else "# ",
     }
 
