@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.error import URLError
 
 from pydantic import StringConstraints
 
@@ -14,6 +15,19 @@ if TYPE_CHECKING:
 
 FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
 """The name of a file in the folder of what names it, and of nothing above or below."""
+
+
+def reason_of(error: Exception) -> str:
+    """Return why a library cannot read a file, in one line."""
+    if isinstance(error, URLError):
+        # Found by pyuvdata, from a list that astropy keeps once it has it.
+        return (
+            "it does not have the place of its telescope, and the list of telescopes cannot be fetched without internet"
+        )
+    lines = str(error).strip().splitlines()
+    # The message of a missing key is the key alone.
+    kind = f"{type(error).__name__}: " if isinstance(error, LookupError) or not lines else ""
+    return kind + (lines[0] if lines else "no reason given")
 
 
 def require_inside(path: Path, folder: Path) -> None:

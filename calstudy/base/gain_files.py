@@ -21,7 +21,7 @@ import numpy as np
 
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
-from calstudy.base.foreign_files import require_self_contained
+from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gains import known_gains
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def read_gain_file(path: Path, where: str) -> UVCal | GainTable:
         return read(path)
     # The readers raise the errors of their libraries; the user must correct a file that cannot be read.
     except (OSError, ValueError, LookupError, RuntimeError, TypeError, AttributeError) as error:
-        raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({error})") from None
+        raise InputError(f"{where} = {str(path)!r}: not a readable {kind} ({reason_of(error)})") from None
 
 
 def read_gain_pair(first: Path, second: Path) -> tuple[UVCal, UVCal]:

@@ -19,7 +19,7 @@ from pyuvdata import UVData, utils
 
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
-from calstudy.base.foreign_files import require_self_contained
+from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gain_files import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata
 from calstudy.calibrate.records import PARALLEL_HANDS
@@ -53,7 +53,7 @@ def read_visibilities(paths: Sequence[Path], read_data: bool = True) -> UVData:
     try:
         data.read(str(paths[0]) if len(paths) == 1 else [str(path) for path in paths], read_data=read_data)
     except UNREADABLE as error:
-        raise InputError(f"{names}: cannot be read as visibilities ({_first_sentence(error)})") from None
+        raise InputError(f"{names}: cannot be read as visibilities ({reason_of(error)})") from None
     if read_data and data.data_array is None:
         raise InputError(f"{names}: holds no visibilities")
     # The times of Miriad folders come with the visibilities.
@@ -114,10 +114,6 @@ def _require_plausible(data: UVData, names: str) -> None:
         raise InputError(
             f"{names}: integration times of {durations.min():g} to {durations.max():g} s; they must be positive"
         )
-
-
-def _first_sentence(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else 'no reason given'}"
 
 
 def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:

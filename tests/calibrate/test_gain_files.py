@@ -4,12 +4,14 @@ import os
 import struct
 import subprocess
 from importlib.util import find_spec
+from urllib.error import URLError
 
 import h5py
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from pyuvdata import UVCal
 from toy import complex_normal, make_toy, scattered
 from toy_data import make_uvdata
 
@@ -359,6 +361,16 @@ def test_faults_are_sentences(world, tmp_path, name):
     write(tmp_path / name, gains.conj(), data)
     with pytest.raises(InputError, match=sentence):
         by_file(tmp_path / name, data, sky)
+
+
+def test_a_telescope_whose_place_has_to_be_fetched_is_said_without_internet(tmp_path, monkeypatch):
+    def fail(*arguments, **options):
+        raise URLError("no network")
+
+    monkeypatch.setattr(UVCal, "from_file", fail)
+    (tmp_path / "gains.calfits").write_text("")
+    with pytest.raises(InputError, match="the place of its telescope"):
+        read_gains(tmp_path / "gains.calfits", "test")
 
 
 @pytest.mark.parametrize("name", FORMATS)
