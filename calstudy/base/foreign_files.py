@@ -20,9 +20,9 @@ FileName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]
 def reason_of(error: Exception) -> str:
     """Return why a library cannot read a file, in one line."""
     if isinstance(error, URLError):
-        # Found by pyuvdata, from a list that astropy keeps once it has it.
+        # From a list that astropy keeps once it has it.
         return (
-            "it does not have the place of its telescope, and the list of telescopes cannot be fetched without internet"
+            f"it lacks the location of its telescope, and the list of telescopes could not be fetched: {error.reason}"
         )
     lines = str(error).strip().splitlines()
     # The message of a missing key is the key alone.

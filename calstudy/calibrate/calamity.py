@@ -33,7 +33,7 @@ SEARCH_TOLERANCE, NEAR = 1e-3, 0.1
 
 Solves to this tolerance move on slowly, and deviations with them, so that these do not settle."""
 QUICK_PASSES = 3
-"""Passes after which single precision no longer has patience: its rounding may be all that weights still change by."""
+"""Passes after which fits with a finite prior are in double precision: in single, rounding may change weights."""
 NO_EXACT_SOLVE = "only solves with the tolerance of the search for the deviation gave gains"
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 UNRESOLVED_DEVIATION = (

@@ -47,12 +47,7 @@ SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
 Redundant = Annotated[bool, typer.Option("--redundant", help="One foreground model per redundant group.")]
 GainsOnly = Annotated[bool, typer.Option("--gains-only", help="Freeze the sky model and solve for gains alone.")]
-Weighting = Annotated[
-    str | None,
-    typer.Option(
-        help="autos (default of fits if there are autocorrelations), gains (else), flags, nsamples, or a UVFlag file."
-    ),
-]
+Weighting = Annotated[str | None, typer.Option(help="gains (default), flags, nsamples, autos, or a UVFlag file.")]
 Select = Annotated[
     list[str] | None,
     typer.Option(

@@ -40,7 +40,7 @@ the residual above which something else does."""
 RAN_AWAY = "the weights, from the gains, do not settle: the gains are lost in noise"
 NAMED = 6
 """Largest number of antennas named in a warning; solution.json has all of them."""
-OTHER_WEIGHTS = "take weights that do not come from the gains (weights: autos, if the data have autocorrelations)"
+OTHER_WEIGHTS = "take `weights: autos` if the data have autocorrelations"
 REMEDY = "solve more integrations together (integrations_per_solve), or smooth the gains (smooth_gains)"
 
 
@@ -199,7 +199,7 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=7):
             write_gain_errors(output / GAINS, ErrorsOfFile(errors[0], errors[1], smooth_delay, used))
         write_json(output / ERRORS, {"records": records})
         away = reasons.count(RAN_AWAY)
-        warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {OTHER_WEIGHTS}, {REMEDY}"] if away else []
+        warnings = [f"{away} of {len(records)} solves: {RAN_AWAY}; {OTHER_WEIGHTS}; else {REMEDY}"] if away else []
         if self.realizations and None in reasons:
             warnings.append("gains have errors by the fit itself; realizations were not needed, and not made")
         if drowned:

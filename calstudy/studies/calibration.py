@@ -27,7 +27,7 @@ from calstudy.base.visibilities import antenna_pairs, flag_cube
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
-from calstudy.calibrate.settings import AutoWeights, GainFit
+from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
@@ -200,7 +200,7 @@ class DataCalibration(DataStudy):
                 "also: hyperdrive and mwaocal hold gains of xx and yy, which the data do not both have; take calfits "
                 "or h5parm"
             )
-        return cls(_weighted(content, facts), Parts({WHOLE: facts}))
+        return cls(content, Parts({WHOLE: facts}))
 
     @property
     def content(self) -> Any:
@@ -347,17 +347,6 @@ def flag_unsolved(folder: Path) -> None:
             data.data_array[data.flag_array] = 0
         (folder / name).unlink()
         write_visibilities(data, folder / name, single=True)
-
-
-def _weighted(content: CalibrationFile, facts: Facts) -> CalibrationFile:
-    """Return a file whose fit has weights from autocorrelations, if there are any and no others are asked for.
-
-    In measured data the signal to noise of single samples is often a few, and weights from gains run away.
-    """
-    fit = content.calibration
-    if not (facts.autos and isinstance(fit, GainFit)) or "weights" in fit.model_fields_set:
-        return content
-    return content.model_copy(update={"calibration": fit.model_copy(update={"weights": AutoWeights(kind="autos")})})
 
 
 def calibration_file(sections: Mapping[str, Any], output: Path, overrides: Sequence[str] = ()) -> StudyFile:

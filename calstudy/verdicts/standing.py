@@ -56,9 +56,9 @@ WORST = ("fails", "open", "passes")
 LIMIT = 0.1
 """Largest tolerated bias, over the EoR."""
 SIGMAS = 2.0
-AT_LIMIT, HOPELESS = 1.05, 1000.0
-"""Factors by which errors must be smaller to tell: below the first the bias is near the limit; beyond the second, which
-is a million times as many integrations, none would tell."""
+AT_LIMIT, OUT_OF_REACH = 1.05, 1000.0
+"""Factors by which errors must be smaller to tell: below the first the bias is near the limit; those beyond the second
+are not named."""
 NAMED = 3
 """Number of worlds, and of calibrators that fail in few, that are named; others are counted."""
 MORE = 0.02
@@ -175,7 +175,7 @@ class InBand:
         large = [world.bias_error for world in decisive if not world.upper_limit < self.limit]
         smaller = (SIGMAS + 1) * max(large, default=0.0) / self.limit
         told = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
-        told = "no number of integrations would tell" if smaller > HOPELESS else told
+        told = f"errors would have to be over {OUT_OF_REACH:g} times smaller" if smaller > OUT_OF_REACH else told
         told = told if large else "T is not measured there"
         if not all(math.isfinite(world.upper_limit) for world in decisive):
             told = "a wider band of k, or more baselines, would tell"

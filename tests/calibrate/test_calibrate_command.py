@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from pyuvdata import UVCal, UVData
-from toy import make_toy
 from toy_data import make_uvdata
 
 import calstudy
@@ -25,7 +24,7 @@ from calstudy.cli import main as cli
 from calstudy.interface import CalibratedData
 from calstudy.power.tables import load_spectrum
 from calstudy.realdata.settings import defaults
-from calstudy.studies.calibration import FIGURE_FILES, IN_USE, DataCalibration, calibration_file
+from calstudy.studies.calibration import FIGURE_FILES, IN_USE
 
 WRITTEN = {"gains.calh5", "model.uvh5", "residual.uvh5", "solution.json", *FIGURE_FILES}
 """Without options."""
@@ -255,22 +254,6 @@ def test_mistakes_are_one_sentence(command, data, arguments, sentence):
     assert len(complaints) == 1
     assert sentence in complaints[0]
     assert "Traceback" not in error
-
-
-def weights_of(path, **calibration):
-    sections = {"observed": {"data": [str(path)]}, "calibration": {"calibrator": "calamity", **calibration}}
-    return DataCalibration.load(calibration_file(sections, path.parent / "out")).file.calibration.weights.kind
-
-
-def test_weights_are_from_autocorrelations_if_there_are_any_and_no_others_are_asked_for(toy, data):
-    assert weights_of(data) == "gains"
-    path = data.with_name("with-autos.uvh5")
-    both = make_uvdata(make_toy(toy.positions, autos=True), 2)
-    autos = both.ant_1_array == both.ant_2_array
-    both.data_array[autos] = np.abs(both.data_array[autos])
-    both.write_uvh5(str(path))
-    assert weights_of(path) == "autos"
-    assert weights_of(path, weights="gains") == "gains"
 
 
 def test_what_the_memory_does_not_hold_is_refused(command, data, tmp_path):

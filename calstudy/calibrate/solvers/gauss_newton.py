@@ -128,7 +128,7 @@ class GaussNewtonState:
     def decided_by_prior(self, patience: int) -> bool:
         """Whether a finite prior determines directions along which single precision is slow, or finds no lower loss.
 
-        It counts as slow after `patience` steps as well.
+        After `patience` steps a fit counts as slow in any case.
         """
         shrinks = not math.isfinite(self.gained) or self.predicted < SLOW * self.gained
         slow = self.boost > 1 or not shrinks or len(self.history) > patience
