@@ -39,15 +39,9 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     """
     used = ~data.flags[:, fitted] & ~dead_samples(data, fitted)
     if settings.kind == "nsamples":
-        counts = np.where(used, data.nsamples[:, fitted], 0)
-        if (bad := ~np.isfinite(counts) | (counts < 0)).any():
-            raise InputError(
-                f"weights: 'nsamples' needs counts that are finite and not negative, and {bad.sum()} unflagged samples "
-                "have others; flag them, or use weights: gains"
-            )
-        weights = counts * used
+        weights = _counts(data, fitted, used, settings.kind)
     elif settings.kind == "autos":
-        weights = _from_autos(data, fitted) * used
+        weights = _counts(data, fitted, used, settings.kind) * _from_autos(data, fitted)
     elif settings.kind == "file":
         weights = _from_file(data, settings)[:, fitted] * used
     else:
@@ -55,6 +49,17 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     size = weights.shape[1] * weights.shape[2]
     count, total = (np.sum(values, axis=(1, 2), keepdims=True) for values in (weights > 0, weights))
     return weights * (count / size / np.where(total > 0, total, 1))
+
+
+def _counts(data: Observation, fitted: np.ndarray, used: np.ndarray, kind: str) -> np.ndarray:
+    """Return the numbers of measurements of samples, zero where they are not used."""
+    counts = np.where(used, data.nsamples[:, fitted], 0)
+    if (bad := ~np.isfinite(counts) | (counts < 0)).any():
+        raise InputError(
+            f"weights: {kind!r} needs counts that are finite and not negative, and {bad.sum()} unflagged samples have "
+            "others; flag them, or use weights: gains"
+        )
+    return counts
 
 
 def inverse_variances(
@@ -73,7 +78,7 @@ def inverse_variances(
     sigma = settings.foreground_prior.noise or noise
     if sigma is None and settings.weights.kind == "autos":
         samples = abs(float(np.mean(data.uvd.channel_width))) * float(np.mean(data.uvd.integration_time))
-        precision = _from_autos(data, fitted) * samples
+        precision = _from_autos(data, fitted) * data.nsamples[:, fitted] * samples
     elif sigma:
         precision = data.nsamples[:, fitted] / sigma**2
     else:
@@ -83,7 +88,7 @@ def inverse_variances(
 
 
 def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:
-    """Return nsamples / (V_aa V_bb), zero where either is flagged or not positive."""
+    """Return 1 / (V_aa V_bb), zero where either is flagged or not positive."""
     antennas, autos = data.antennas[fitted], np.flatnonzero(data.autos)
     missing = data.numbers[np.setdiff1d(antennas, data.antennas[autos])]
     if missing.size:
@@ -94,7 +99,7 @@ def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:
     power = np.where(data.flags, 0, np.nan_to_num(data.visibilities.real))
     inverse = np.where(power > 0, 1 / np.where(power > 0, power, 1), 0)
     first, second = autos[positions(data.antennas[autos, 0], antennas)].T
-    return inverse[:, first] * inverse[:, second] * data.nsamples[:, fitted]
+    return inverse[:, first] * inverse[:, second]
 
 
 def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:

@@ -79,6 +79,15 @@ def measured():
     return data
 
 
+@pytest.mark.parametrize("count", [np.nan, -1.0])
+@pytest.mark.parametrize("settings", [AutoWeights(kind="autos"), SampleWeights(kind="nsamples")])
+def test_counts_that_are_none_are_refused(measured, settings, count):
+    cross = np.not_equal(*antenna_pairs(measured).T)
+    measured.nsample_array[np.flatnonzero(measured.ant_1_array != measured.ant_2_array)[0], 3] = count
+    with pytest.raises(InputError, match=f"weights: '{settings.kind}' needs counts .*, and 1 unflagged samples"):
+        make_weights(Observation(measured), cross, settings)
+
+
 @pytest.mark.parametrize("settings", [AutoWeights(kind="autos"), SampleWeights(kind="nsamples"), FlagWeights()])
 def test_weights_of_finite_priors_are_inverse_variances(measured, settings):
     """Against the radiometer equation, and against a noise that is given for samples that were measured once."""
