@@ -147,8 +147,8 @@ MUTATIONS = (
     ),
     Mutation(
         "weights from autocorrelations without counts",
-        "inverse[:, second] * data.nsamples[:, fitted]",
-        "inverse[:, second]",
+        "weights = _counts(data, fitted, used, settings.kind) * _from_autos(data, fitted)",
+        "weights = used * _from_autos(data, fitted)",
         ("tests/calibrate/test_weights_and_starts.py",),
     ),
     Mutation(
