@@ -60,6 +60,11 @@ class DiagonalPSpecData(PSpecData):
         """Return the identity (Nfreqs, Nfreqs), one for all baselines."""
         return self._shared(("identity", self.spw_Nfreqs), lambda: np.identity(self.spw_Nfreqs))
 
+    def w(self, key: tuple, include_extension: bool = False) -> np.ndarray:
+        """Return the weights of a baseline, 1 where it is not flagged, (Nfreqs, Ntimes), once per baseline."""
+        found = super().w
+        return self._shared(("weights", key, include_extension), lambda: found(key, include_extension))
+
     def Y(self, key: tuple) -> np.ndarray:
         """Return the flag weights of a baseline on the diagonal, 1 where any time is unflagged, (Nfreqs, Nfreqs)."""
         weights = self._flag_weights(key)
