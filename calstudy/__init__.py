@@ -14,14 +14,21 @@ except PackageNotFoundError:
     __version__ = "0+unknown"
 
 # `calibrate` is the package of that name.
-INTERFACE = ("load", "open_run", "calibrate_data")
+INTERFACE = {
+    "load": "interface",
+    "open_run": "interface",
+    "calibrate_data": "interface",
+    "InputError": "base.errors",
+    "ExperimentError": "base.errors",
+}
+"""Names of the Python interface, and the modules that have them."""
 __all__ = ["__version__", *INTERFACE]
 
 
 def __getattr__(name: str) -> object:
     # What these functions need takes a second to import, which commands such as --help do without.
     if name in INTERFACE:
-        return getattr(import_module("calstudy.interface"), name)
+        return getattr(import_module(f"calstudy.{INTERFACE[name]}"), name)
     raise AttributeError(f"module 'calstudy' has no attribute {name!r}")
 
 

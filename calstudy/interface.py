@@ -242,6 +242,11 @@ class LoadedStudy:
         """The validated experiment, whose quantities are numbers in SI units; InputError if there are several."""
         return _single(self._study).experiment
 
+    @property
+    def parts(self) -> dict[str, LoadedStudy]:
+        """The members of a collection, or the points of a sweep, by name."""
+        return {name: LoadedStudy(part) for name, part in self._study.parts.items()}
+
     def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
         """Return the stages of a run with the estimated time, memory and disk.
 

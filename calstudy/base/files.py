@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -28,6 +28,11 @@ def digest_json(value: Any) -> str:
 def json_number(value: float) -> float | None:
     """Return a number for JSON: None if it is not finite."""
     return float(value) if math.isfinite(value) else None
+
+
+def rounded(values: Iterable[float]) -> list[float | None]:
+    """Return numbers for JSON with five digits: None where they are not finite."""
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values]
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 
 from calstudy.base.errors import InputError
 
@@ -32,7 +33,7 @@ def load_tensorflow() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if "tensorflow" in sys.modules:
         return
-    with _without_keras(), _silent():
+    with _without_keras(), errors_written_to(Path(os.devnull)):
         importlib.import_module("tensorflow")
 
 
@@ -48,16 +49,21 @@ def _without_keras() -> Iterator[None]:
             del os.environ[KERAS]
 
 
+def write_errors_to(path: Path) -> None:
+    """Append the standard error of this process and its libraries to a file from now on."""
+    with path.open("a") as file:
+        os.dup2(file.fileno(), 2)
+
+
 @contextmanager
-def _silent() -> Iterator[None]:
-    """Discard output to standard error within the block."""
+def errors_written_to(path: Path) -> Iterator[None]:
+    """Append the standard error within the block to a file."""
     sys.stderr.flush()
     kept = os.dup(2)
-    silence = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(silence, 2)
+        write_errors_to(path)
         yield
     finally:
+        sys.stderr.flush()
         os.dup2(kept, 2)
         os.close(kept)
-        os.close(silence)

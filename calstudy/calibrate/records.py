@@ -135,11 +135,6 @@ class CalibrationResult:
     residual: UVData
     solutions: tuple[Solve, ...]
 
-    @property
-    def unconverged(self) -> tuple[Solve, ...]:
-        """The solves that did not reach the minimum."""
-        return tuple(record for record in self.solutions if record.status not in SETTLED)
-
     def solved_gains(self, solve: Solve, rows: np.ndarray, place: int) -> np.ndarray:
         """Return the gains of a solve, (len(rows), Nfreqs): each of an integration in which it is not flagged.
 

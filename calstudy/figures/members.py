@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -38,12 +37,6 @@ class MemberBias:
     k: np.ndarray
     bias: np.ndarray
     bias_error: np.ndarray
-
-
-def read_member(folder: Path) -> MemberBias:
-    """Read the bias of a member from its scores."""
-    bins = Tables((folder,)).score
-    return MemberBias(bins.k, bins.bias, bins.bias_error)
 
 
 @style.journal_style()
@@ -92,7 +85,8 @@ class MemberBiasFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw all members."""
-        members = {name: read_member(found["score"]) for name, found in members_of(job).items()}
+        bins = {name: Tables((found["score"],)).score for name, found in members_of(job).items()}
+        members = {name: MemberBias(found.k, found.bias, found.bias_error) for name, found in bins.items()}
         return Drawing(draw_member_bias(members), members)
 
 

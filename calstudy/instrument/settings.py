@@ -68,6 +68,11 @@ class Channels(Section):
         """Centres of the first and the last channel, Hz."""
         return self.first, self.first + (self.count - 1) * self.width
 
+    @property
+    def label(self) -> str:
+        """Number, width and first of the channels."""
+        return f"{self.count} channels of {self.width / 1e3:g} kHz from {self.first / 1e6:g} MHz"
+
 
 class Times(Section):
     """Equally spaced integrations; the default is the paper's (56 x 2 s from LST 1.8 h)."""

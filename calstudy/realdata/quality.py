@@ -11,6 +11,7 @@ from astropy.time import Time
 from pyuvdata import UVCal, UVData
 
 from calstudy.base.constants import SECONDS_PER_DAY
+from calstudy.base.files import rounded
 from calstudy.base.gains import gain_products
 from calstudy.base.visibilities import (
     antenna_pairs,
@@ -95,17 +96,13 @@ class Quality:
             "polarization": self.polarization,
             "noise": self.noise,
             "antennas": [str(name) for name in self.antennas],
-            "gain_by_antenna": _plain(self.gain_by_antenna),
-            "gain_by_channel": _plain(np.fmax.reduce(self.gain_by_channel, axis=0)),
-            "chi2_by_antenna": _plain(self.chi2_by_antenna),
-            "chi2_by_channel": _plain(self.chi2_by_channel),
-            "chi2_by_integration": _plain(self.chi2_by_integration),
+            "gain_by_antenna": rounded(self.gain_by_antenna),
+            "gain_by_channel": rounded(np.fmax.reduce(self.gain_by_channel, axis=0)),
+            "chi2_by_antenna": rounded(self.chi2_by_antenna),
+            "chi2_by_channel": rounded(self.chi2_by_channel),
+            "chi2_by_integration": rounded(self.chi2_by_integration),
             "warnings": self.warnings,
         }
-
-
-def _plain(values: np.ndarray) -> list[float | None]:
-    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values]
 
 
 def _median(values: np.ndarray) -> float:

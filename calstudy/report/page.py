@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from calstudy.base.errors import InputError
-from calstudy.base.files import replacing
+from calstudy.base.files import replacing, rounded
 from calstudy.base.paths import leaves
 from calstudy.base.table import Table
 from calstudy.report.headline import Number, read_headline, read_signal
@@ -100,7 +100,7 @@ def _curves(title: str, label: str, logarithmic: bool, found: Mapping[str, tuple
 def curve(label: str, colour: str, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
     """Return a series of a chart: k in h/Mpc, values and errors where values are finite."""
     kept = np.isfinite(points[1])
-    rounded = {key: _rounded(array[kept]) for key, array in zip(("x", "y", "error"), points, strict=True)}
+    rounded = {key: rounded(array[kept]) for key, array in zip(("x", "y", "error"), points, strict=True)}
     return {"label": label, "colour": colour, **rounded}
 
 
@@ -123,19 +123,14 @@ def _maps(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
         values = np.asarray(fields[quantity].real, "<f4")
         if quantity == "transfer":
             logarithmic, label = False, "T"
-        axes = {key: _rounded(fields[key]) for key in ("k_perp", "k_parallel", "baseline_length")}
-        axes["horizon"] = _rounded(fields["horizon_delay"] / fields["delay"][-1])
+        axes = {key: rounded(fields[key]) for key in ("k_perp", "k_parallel", "baseline_length")}
+        axes["horizon"] = rounded(fields["horizon_delay"] / fields["delay"][-1])
         encoded = base64.b64encode(values.tobytes()).decode("ascii")
         series.append({"label": SERIES.get(name, (name,))[0], "values": encoded, **axes})
     if not series:
         return None
     kind = {"kind": "maps", "value": label, "logarithmic": logarithmic, "series": series}
     return Chart("Cylindrical power spectra" if logarithmic else "Cylindrical T", kind)
-
-
-def _rounded(values: np.ndarray) -> list[float | None]:
-    """Return numbers with five digits, None where they are not finite."""
-    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in np.asarray(values, float)]
 
 
 CLAIMS_TITLE = "Claims of the paper"

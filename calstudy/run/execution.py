@@ -8,7 +8,6 @@ import logging
 import os
 import shutil
 import socket
-import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
+from calstudy.base.quiet import errors_written_to, write_errors_to
 from calstudy.base.resources import Usage, cores, free_memory, parse_memory
 from calstudy.base.schema import plain
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
@@ -311,29 +311,9 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
     return Schedule(tuple(todo.values()), tuple(damaged), frozenset(again))
 
 
-def _write_errors_to(path: Path) -> None:
-    """Append the standard error of this process and its libraries to a file from now on."""
-    with path.open("a") as file:
-        os.dup2(file.fileno(), 2)
-
-
-@contextmanager
-def _errors_written_to(path: Path) -> Iterator[None]:
-    """Append the standard error within the block to a file."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        _write_errors_to(path)
-        yield
-    finally:
-        sys.stderr.flush()
-        os.dup2(kept, 2)
-        os.close(kept)
-
-
 def _set_up_worker(log: Path) -> None:
     """Prepare a process of this machine for orders."""
-    _write_errors_to(log)
+    write_errors_to(log)
     # Orders need it when they arrive, in one thread, and stages in another: two threads that import it at once can lock
     # each other out (`_frozen_importlib._DeadlockError`).
     import_module("astropy.units")
@@ -362,7 +342,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     with (
         dask.config.set(settings),
         # The thread that works here may be at another product when the run ends, and closes last.
-        _errors_written_to(log) if workers == 1 else nullcontext(),
+        errors_written_to(log) if workers == 1 else nullcontext(),
         _cluster(workers) as cluster,
         Client(cluster) as client,
     ):

@@ -7,7 +7,6 @@ than the tolerance of the interpolation.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
 
     from calstudy.instrument.settings import InstrumentSettings
     from calstudy.simulate.settings import SimulationSettings
-
-logger = logging.getLogger(__name__)
 
 PART_NSIDE = 8
 """Resolution of the grid whose cells are divided between the parts of the sky."""

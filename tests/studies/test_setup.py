@@ -31,3 +31,12 @@ def test_a_change_is_in_the_line(change, words):
 def test_a_comparison_has_the_data_of_all_worlds_only_if_they_are_the_same():
     assert "antennas" in load_study(Path("prior")).setup.split(";")[0]
     assert load_study(Path("calibrators")).setup == ""
+
+
+def test_the_line_of_measured_data_is_that_of_the_file():
+    # hera_qm's file has 19 antennas, of which the study leaves one out, 100 MHz in 1024 channels, and steps of 10.7 s.
+    line = load_study(Path("hera19")).setup
+    for words in ("18 antennas", "channels of 97.6562 kHz", "3 integrations of 10.7 s", "EoR injected at -30 dB"):
+        assert words in line
+    without = load_study(Path("hera19"), overrides=["injection=null", "outputs.figures=null"]).setup
+    assert "no EoR injected" in without

@@ -39,6 +39,17 @@ class Measured:
     verdicts: list[Verdict]
 
 
+def test_the_small_scale_calibrates_as_the_full_one():
+    """Its experiments are of a file of its own, whose defaults differ from the published files': weights, for one."""
+    full, small = (
+        {(step.number, name): item.calibration for step, found in ladder.steps for name, item in found.items()}
+        for ladder in (load_ladder(STEPS, scale, []) for scale in ("full", "small"))
+    )
+    assert full.keys() == small.keys()
+    for place, calibration in full.items():
+        assert calibration.with_defaults("chunks") == small[place].with_defaults("chunks"), place
+
+
 @pytest.fixture(scope="module", params=["quick", pytest.param("all", marks=pytest.mark.slow)])
 def measured(request, tmp_path_factory) -> Measured:
     folder = tmp_path_factory.mktemp("ladder")

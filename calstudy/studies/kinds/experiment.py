@@ -256,13 +256,13 @@ def describe_setup(experiment: Experiment) -> str:
 def describe_data(experiment: Experiment) -> str:
     """Return the array, the band, the times, the gains and the noise of an experiment."""
     instrument = experiment.instrument
-    frame, channels, times = frame_of(instrument), instrument.channels, instrument.times
+    frame, times = frame_of(instrument), instrument.times
     effects = ", ".join(effect.label for effect in experiment.corruption.effects)
     return "; ".join(
         (
             f"{frame.n_antennas} antennas ({instrument.layout.label}), baselines to {frame.lengths.max():.3g} m, "
             f"beam {instrument.beam.label}",
-            f"{channels.count} channels of {channels.width / 1e3:g} kHz from {channels.first / 1e6:g} MHz",
+            instrument.channels.label,
             f"{times.count} integrations of {times.integration:g} s",
             effects or "no gains",
             _noise(experiment),

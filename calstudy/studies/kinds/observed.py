@@ -65,6 +65,22 @@ class ObservedStudy(DataStudy):
         return ("flux scale: autocorrelations at an assumed system temperature",)
 
     @property
+    def setup(self) -> str:
+        """The array, the band, the times, the injected EoR and the calibrator."""
+        section, injection, facts = self.file.observed, self.file.injection, self.data.facts["even"]
+        level = "" if injection is None or injection.level is None else f" at {injection.level:g} dB"
+        return "; ".join(
+            (
+                f"{facts.antennas} antennas, baselines to {facts.size(1).longest:.3g} m, beam {section.beam.label}",
+                facts.channels.label,
+                f"{facts.times.size} integrations of {facts.integration:.3g} s"
+                + (" in each half" if section.odd else ""),
+                "no EoR injected" if injection is None else f"EoR injected{level}",
+                self.file.calibration.label,
+            )
+        )
+
+    @property
     def content(self) -> Any:
         """The content of the file without scales and the folders of outputs."""
         outputs = self.file.outputs.with_defaults("store", "runs")
