@@ -184,13 +184,15 @@ class _Passes:
         current = self._for_pass(problem, gains, deviations)
         done: list[_Pass] = []
         found: Estimate | None = None
-        change, anew, exact, searched = 0.0, True, self._search is self._solver, False
+        start, change, anew, fault = warm, 0.0, True, ""
+        exact, searched = self._search is self._solver, False
         while len(done) < self._most:
             exact = exact or len(done) == self._most - 1
             solver = self._search if not exact else self._solver if len(done) < QUICK_PASSES else self._late
             solution, warm, anew = _solve(current, solver, warm, anew)
             if done and not solution.record.usable:
-                return self._kept(done, change, found, NO_EXACT_SOLVE if searched else "")
+                fault = NO_EXACT_SOLVE if searched else ""
+                break
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
             if not solution.record.usable:
                 break
@@ -207,7 +209,21 @@ class _Passes:
             far = solution.record.status == "max-steps" or not (found is None or found.resolved)
             if far or (settled and not searched):
                 break
-        return self._kept(done, change, found)
+        ran_away = len(done) > 1 and change > RUNAWAY
+        instead = self._with_equal_weights(problem, start, found and found.deviations) if ran_away else None
+        return self._kept(done, change, found, fault, instead)
+
+    def _with_equal_weights(
+        self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
+    ) -> _Pass | None:
+        """Solve with the weights of unity gains, which do not depend on gains that are lost in noise; None if it fails.
+
+        Those of the first pass may: they are of the gains of the integration before.
+        """
+        equal = self._for_pass(problem, np.ones_like(problem.initial_gains), deviations)
+        solution, warm, _ = _solve(equal, self._solver, warm, True)
+        used = equal.fractions if self._estimated else None
+        return _Pass(solution, warm, used) if solution.record.usable else None
 
     def _for_pass(
         self, problem: CalibrationProblem, gains: np.ndarray, deviations: tuple[float, float] | None
@@ -215,13 +231,20 @@ class _Passes:
         found = problem if self._weights is None else problem.weighted_by(gains)
         return found if deviations is None else found.with_fractions(deviations)
 
-    def _kept(self, done: Sequence[_Pass], change: float, found: Estimate | None, fault: str = "") -> _Pass:
-        """Return the last pass, or the first where weights run away, with what all passes say in its record.
+    def _kept(
+        self,
+        done: Sequence[_Pass],
+        change: float,
+        found: Estimate | None,
+        fault: str = "",
+        instead: _Pass | None = None,
+    ) -> _Pass:
+        """Return the last pass, or another `instead`, with what all passes say in its record.
 
         A `fault` makes a converged pass a stalled one.
         """
-        kept = done[0 if len(done) > 1 and change > RUNAWAY else -1]
-        record = _together([one.solution.record for one in done])
+        kept = instead or done[-1]
+        record = _together([one.solution.record for one in (*done, *([instead] if instead else []))])
         if fault and record.status == "converged":
             record = replace(record, status="stalled", message=fault)
         if self._weights is not None and self._weights.unsettled(change) and record.status == "converged":
@@ -230,7 +253,7 @@ class _Passes:
         if self._weights is not None:
             notes["weight_change"] = change
         if found is not None and kept.deviations is not None:
-            error = found.error if kept is done[-1] else (None, None)
+            error = found.error if instead is None else (None, None)
             notes |= {"deviation": list(kept.deviations), "deviation_error": list(error)}
             if not found.resolved:
                 record = replace(record, status="stalled", message=UNRESOLVED_DEVIATION)

@@ -89,7 +89,7 @@ UNSETTLED = 10.0
 LEAST_TAPER = 1e-4
 """Antennas whose baselines all have less than this part of their weight are left out of a fit."""
 RUNAWAY = 1.0
-"""Weights that change by more than themselves in the last pass run away; the first pass is the result then."""
+"""Weights that change by more than themselves in the last pass run away; the result is that of equal weights then."""
 
 
 class GainWeights(Section):
@@ -97,7 +97,7 @@ class GainWeights(Section):
 
     The first pass has the weights of the gains that it starts from; each other pass those of the gains of the pass
     before. After a pass that ends at the largest number of steps there is no other. Where weights run away, as with a
-    signal to noise of one in every sample, the first pass is the result, and its status says so.
+    signal to noise of one in every sample, the result is that of equal weights, and its status says so.
     """
 
     kind: Literal["gains"] = "gains"
@@ -123,7 +123,7 @@ class GainWeights(Section):
 def unsettled_message(change: float, passes: int) -> str:
     """Return the message for a fit whose weights from its gains have not converged."""
     sentence = f"weights from the gains still changed by {change:.1e} in pass {passes}"
-    return f"{sentence}, so that the first pass is the result" if change > RUNAWAY else sentence
+    return f"{sentence}, so that the result is that of equal weights" if change > RUNAWAY else sentence
 
 
 class FlagWeights(Section):

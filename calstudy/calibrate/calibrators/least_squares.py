@@ -94,16 +94,18 @@ def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
 class Calamity(_LeastSquares, ForegroundFit):
     """Gains are fitted together with a smooth foreground model of each baseline (paper Eq. LOGLIKELIHOOD)."""
 
-    # Foregrounds are modelled between the flagged edges of the band since 2.
-    version: ClassVar[int] = 2
+    # Foregrounds are modelled between the flagged edges of the band since 2. Where weights run away, the result is that
+    # of equal weights since 3, in every integration.
+    version: ClassVar[int] = 3
     calibrator: str = "calamity"
 
 
 class CalamityRedundant(_LeastSquares, ForegroundFit):
     """Gains are fitted with a smooth foreground model of each redundant group (paper Eq. LOGLIKELIHOODREDUNDANT)."""
 
-    # Foregrounds are modelled between the flagged edges of the band since 2.
-    version: ClassVar[int] = 2
+    # Foregrounds are modelled between the flagged edges of the band since 2. Where weights run away, the result is that
+    # of equal weights since 3, in every integration.
+    version: ClassVar[int] = 3
     calibrator: str = "calamity-redundant"
     foreground_prior: ForegroundPrior = ForegroundPrior(deviation=0.0, shared_deviation="infinite")
 
@@ -111,6 +113,8 @@ class CalamityRedundant(_LeastSquares, ForegroundFit):
 class SkyBased(_LeastSquares):
     """Only gains are fitted; the sky model is taken as the true foregrounds."""
 
+    # Where weights run away, the result is that of equal weights since 2, in every integration.
+    version: ClassVar[int] = 2
     calibrator: str = "sky-based"
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
@@ -126,7 +130,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     # Fits whose preconditioner is singular in single precision converge since 4.
     # Directions that only the prior determines are fitted in double precision since 5.
     # So are fits that need many steps since 6.
-    version: ClassVar[int] = 6
+    # Where weights run away, the result is that of equal weights since 7, in every integration.
+    version: ClassVar[int] = 7
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -142,7 +147,8 @@ class Unified(_LeastSquares, ForegroundFit):
     # Fits whose preconditioner is singular in single precision converge since 4.
     # Directions that only the prior determines are fitted in double precision since 5.
     # So are fits that need many steps since 6.
-    version: ClassVar[int] = 6
+    # Where weights run away, the result is that of equal weights since 7, in every integration.
+    version: ClassVar[int] = 7
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -157,7 +163,8 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
     # Fits whose preconditioner is singular in single precision converge since 3.
     # Directions that only the prior determines are fitted in double precision since 4.
     # So are fits that need many steps since 5.
-    version: ClassVar[int] = 5
+    # Where weights run away, the result is that of equal weights since 6, in every integration.
+    version: ClassVar[int] = 6
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"
