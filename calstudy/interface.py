@@ -589,11 +589,13 @@ def _overrides(changes: Mapping[str, Any], section: str = "") -> list[str]:
 
 
 def _plain(value: Any, path: str = "") -> Any:
-    """Return a value as YAML has it: numbers and arrays of numpy, and paths, as plain ones."""
+    """Return a value as YAML has it: numbers and arrays of numpy, quantities of astropy, and paths, as plain ones."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item, f"{path}.{key}" if path else str(key)) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item, path) for item in value]
+    if hasattr(value, "unit") and hasattr(value, "value"):
+        return f"{_plain(value.value, path)!r} {value.unit}"
     if hasattr(value, "tolist"):
         return _plain(value.tolist(), path)
     if isinstance(value, PurePath):

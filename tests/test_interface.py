@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from astropy import units
 from matplotlib.figure import Figure
 from tiny import tiny
 
@@ -51,6 +52,7 @@ def test_numbers_of_numpy_and_paths_are_plain_ones(file, tmp_path):
     changes = {"instrument.times.count": np.int64(3), "power.wedge_buffer": "250 ns", "outputs.runs": tmp_path}
     study = calstudy.load(file, **changes)
     assert (study.experiment.instrument.times.count, study.experiment.outputs.runs) == (3, tmp_path)
+    assert calstudy.load(file, **{"power.wedge_buffer": 250 * units.ns}).experiment.power.wedge_buffer == 250e-9
     content = yaml.safe_load(file.read_text())
     content["instrument"]["times"]["count"] = np.array([3, 4])[0]
     assert calstudy.load(content).experiment.instrument.times.count == 3
@@ -67,6 +69,12 @@ def test_a_plan_is_a_table_and_a_mapping(file):
     plan = calstudy.load(file).plan(workers=1)
     assert "plan for 1 worker(s)" in repr(plan)
     assert plan.stages.loc["calibrate", "products"] == 4
+
+
+@pytest.mark.parametrize("budget", [{"workers": 0}, {"workers": "2"}, {"max_memory": 6}])
+def test_a_budget_that_is_none_is_refused(file, budget):
+    with pytest.raises(InputError, match=f"{next(iter(budget))} = .*must be"):
+        calstudy.load(file).plan(**budget)
 
 
 def test_spectra_are_those_of_the_tables(run):

@@ -222,7 +222,7 @@ def solutions(
 
     The gains should satisfy `require_solutions`. They are complex and in the convention "divide"; both arrays are
     (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)). `polarizations` are AIPS numbers; raises
-    InputError if `cal` lacks one.
+    InputError if `cal` lacks one, or if all gains are zero or not finite.
     """
     for pol in polarizations:
         if pol not in cal.jones_array:
@@ -230,6 +230,8 @@ def solutions(
     rows, feeds = positions(cal.ant_array, numbers), positions(cal.jones_array, polarizations)
     channels = np.abs(cal.freq_array[None] - frequencies[:, None]).argmin(axis=1)
     gains, flags = (array[rows][:, channels][..., feeds] for array in (cal.gain_array, cal.flag_array))
+    if not (np.isfinite(gains) & (gains != 0)).any():
+        raise InputError("gains: all are zero or not finite")
     if cal.gain_convention == "multiply":
         with np.errstate(divide="ignore", invalid="ignore"):
             gains = 1 / gains

@@ -49,6 +49,7 @@ def init(
     if listed:
         _list_examples()
         return
+    name = name.removesuffix(".yaml")
     path = Path(f"{name}.yaml")
     if example is not None and data is not None:
         raise InputError("--example and --data: choose one")

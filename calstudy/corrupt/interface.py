@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.resources import Cost
+from calstudy.base.schema import fault
 from calstudy.corrupt.drift import Drift, refusal_of_antennas
 
 if TYPE_CHECKING:
@@ -45,6 +46,12 @@ class Effect(Plugin, ABC):
     uses_positions: ClassVar[bool] = True
 
     kind: str = Field("", description="Name of an effect, or a file.py.")
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Self:
+        if type(self).apply is Effect.apply and not self.can_flag:
+            raise fault("", f"{type(self).__name__} defines neither apply nor flags, so that it would do nothing")
+        return self
 
     def refusal(self, size: Size) -> str | None:
         """Return in one sentence why the effect cannot be applied to data of this size, or None if it can.

@@ -23,6 +23,7 @@ class CorruptionSettings(Section):
 
     eor_level: Decibel | None = Field(
         -40.0,
+        le=0.0,
         description="rms of EoR over foregrounds, 10 log10 of brightness: -40 dB is 1e-4; null: absolute units.",
     )
     noise: Noise = NoiseRelativeToEor()

@@ -226,6 +226,17 @@ class Experiment(Section):
         return self
 
     @model_validator(mode="after")
+    def _modes_are_outside_the_wedge(self) -> Experiment:
+        reach = 0.5 / self.instrument.channels.width
+        if self.power.wedge_buffer >= reach:
+            raise fault(
+                "power.wedge_buffer",
+                f"is {1e6 * self.power.wedge_buffer:g} us, and delays reach {1e6 * reach:.4g} us with channels of this "
+                "width, so that no mode is outside the wedge",
+            )
+        return self
+
+    @model_validator(mode="after")
     def _a_finite_prior_has_noise(self) -> Experiment:
         if self.corruption.noise.kind == "none" and self.calibration.needs_noise:
             raise fault(

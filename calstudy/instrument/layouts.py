@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from astropy.coordinates import EarthLocation
 
 
+FARTHEST, SMALLEST = 3e6, 1.0
+"""Largest coordinate of an antenna, which geocentric ones exceed, and smallest width of an array, m."""
 NEARBY = 1.0
 """deg, by which a site may differ from the mean of the positions of its antennas."""
 
@@ -192,12 +194,20 @@ def layout_of(section: Plugin) -> ArrayLayout:
 def make_layout(settings: Plugin) -> Layout:
     """Return the antennas of the `instrument.layout` section.
 
-    Raises InputError if a file is missing, or a layout does not hold what `Layout` says.
+    Raises InputError if a file is missing, or a layout does not hold what `Layout` says or differs from call to call.
     """
     layout = layout_of(settings)
     with guarded(layout):
         made = layout.make()
+        again = made if type(layout).__module__.startswith("calstudy.") else layout.make()
+    if not isinstance(made, Layout):
+        raise InputError(f"{layout.origin}: make returned {made!r}; a Layout is needed, such as self.flat(positions)")
     _require_valid(made, layout.origin)
+    if not np.array_equal(made.enu, again.enu):
+        raise InputError(
+            f"{layout.origin}: make gives other positions at every call, and each product would be of another array; "
+            "draw them with a seed that is a field"
+        )
     return made
 
 
@@ -212,6 +222,12 @@ def _require_valid(made: Layout, origin: str) -> None:
         raise InputError(f"{origin}: antenna numbers (>= 0) and names must be unique")
     if not np.isfinite(made.enu).all():
         raise InputError(f"{origin}: positions must be finite")
+    if np.abs(made.enu).max() > FARTHEST or np.ptp(made.enu, axis=0).max() < SMALLEST:
+        raise InputError(
+            f"{origin}: antennas are up to {np.abs(made.enu).max():.4g} m from the origin, and the array is "
+            f"{np.ptp(made.enu, axis=0).max():.4g} m wide; give east, north and up of a place in the array, in metres, "
+            "not in kilometres or from the centre of the Earth"
+        )
     order = np.lexsort(made.enu.T)
     same = np.flatnonzero((np.diff(made.enu[order], axis=0) == 0).all(axis=1))
     if same.size:

@@ -122,10 +122,11 @@ def noise_power(graph: MeasuredGraph, what: str, source: str) -> Task:
     return cross_power(graph, noise.label, [noise, noise], own)
 
 
-class Observe(Task, stage="observe", version=3):
+class Observe(Task, stage="observe", version=4):
     """The data of one part, and the sky model.
 
     The noise is that of a sample with nsamples of one since version 2, and has the mean of inverse variances since 3.
+    Samples of no measurement are flagged since 4.
     """
 
     files: Sequence[Path]
@@ -181,6 +182,8 @@ class Observe(Task, stage="observe", version=3):
         if self.sky_model is not None:
             alone = Selection(polarizations=selection.polarizations)
             sky, sky_notes = self._prepared(read_visibilities([self.sky_model]), alone)
+            if str(sky.vis_units).lower() not in ("jy", "uncalib", str(data.vis_units).lower()):
+                raise InputError(f"sky model: is in {sky.vis_units!r}, and must be in Jy; convert it first")
             sky, data, left_out = common_baselines(sky, data, bool(self.autos))
             notes += [f"Sky model: {note}" for note in sky_notes] + left_out
         if self.parity is not None:

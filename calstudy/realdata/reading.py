@@ -126,7 +126,7 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
     -------
     data
         Parallel hands only, drift-scan, every baseline once at every time in time-major order; samples that were
-        missing or not finite are flagged.
+        missing, of no measurement or not finite are flagged.
     notes
         One sentence for each change.
     """
@@ -147,6 +147,10 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
     if bad.any():
         data.flag_array |= bad
         notes.append(f"{bad.sum()} samples are not finite (NaN or infinite) and were flagged.")
+    none = (data.nsample_array == 0) & ~data.flag_array
+    if none.any():
+        data.flag_array |= none
+        notes.append(f"{none.sum()} samples are of no measurement (nsamples of 0) and were flagged.")
     for note in notes:
         logger.info(note)
     return data, notes

@@ -100,8 +100,8 @@ def _curves(title: str, label: str, logarithmic: bool, found: Mapping[str, tuple
 def curve(label: str, colour: str, points: tuple[np.ndarray, ...]) -> dict[str, Any]:
     """Return a series of a chart: k in h/Mpc, values and errors where values are finite."""
     kept = np.isfinite(points[1])
-    rounded = {key: rounded(array[kept]) for key, array in zip(("x", "y", "error"), points, strict=True)}
-    return {"label": label, "colour": colour, **rounded}
+    drawn = {key: rounded(array[kept]) for key, array in zip(("x", "y", "error"), points, strict=True)}
+    return {"label": label, "colour": colour, **drawn}
 
 
 def chart_of_curves(title: str, label: str, logarithmic: bool, series: Sequence[Mapping[str, Any]]) -> Chart:

@@ -240,6 +240,14 @@ class Budget:
     scheduler: str | None = None
     strict: bool = False
 
+    def __post_init__(self) -> None:
+        if self.workers is not None and (not isinstance(self.workers, int) or self.workers < 1):
+            raise InputError(
+                f"workers = {self.workers!r}: must be a whole number of at least 1, or None for one per core"
+            )
+        if self.max_memory is not None and not isinstance(self.max_memory, str):
+            raise InputError(f"max_memory = {self.max_memory!r}: must be a text with a unit, such as '6 GB'")
+
     @property
     def memory(self) -> float:
         """Memory of all workers together, bytes."""

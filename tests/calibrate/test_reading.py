@@ -59,6 +59,15 @@ def test_missing_samples_are_flagged(data):
     assert np.array_equal(prepared.baseline_array, data.baseline_array)
 
 
+def test_samples_of_no_measurement_are_flagged_and_counted(data):
+    """In pyuvdata's convention a sample with nsamples of zero holds no data."""
+    data.nsample_array[5, 3] = 0
+    data.nsample_array[6, 4], data.flag_array[6, 4] = 0, True
+    prepared, notes = prepare(data)
+    assert prepared.flag_array[5, 3].all()
+    assert notes == ["1 samples are of no measurement (nsamples of 0) and were flagged."]
+
+
 def test_values_that_are_not_finite_are_flagged_and_counted(data):
     data.data_array[5, 3] = np.nan
     data.data_array[6, 4] = np.inf

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.files import (
     apply_scale,
     dump,
@@ -193,6 +193,19 @@ def test_broken_yaml_is_one_sentence_with_the_line(text, told):
         parse_yaml(text, "file.yaml")
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"corruption": {"eor_level": "40 dB"}}, "corruption.eor_level = '40 dB': must be at most 0"),
+        ({"power": {"wedge_buffer": "7 us"}}, "power.wedge_buffer: is 7 us, and delays reach 6.25 us"),
+    ],
+)
+def test_an_eor_above_the_foregrounds_and_a_wedge_of_all_modes_are_refused(changes, told):
+    with pytest.raises(ExperimentError) as caught:
+        validate({"name": "own", **changes}, Path())
+    assert str(caught.value).startswith(told)
 
 
 def test_an_unknown_scale_lists_those_there_are():

@@ -12,6 +12,7 @@ from calstudy.base.identity import identity
 from calstudy.base.user_code import UserCodeError
 from calstudy.base.visibilities import antenna_indices, to_cube
 from calstudy.corrupt.interface import Effect, apply_effect, draw_truth
+from calstudy.experiment.files import validate
 from calstudy.products import corruption
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
@@ -134,6 +135,17 @@ class Drifting(GainEffect):
     def gains(self, observation, random):
         return np.ones((observation.n_antennas, observation.n_channels, observation.n_times + 1, 1), complex)
 """
+
+
+def test_an_effect_that_does_nothing_is_refused(tmp_path):
+    """A method whose name is misspelt would be missed in silence."""
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from calstudy.corrupt.interface import Effect\n\nclass Own(Effect):\n"
+        "    def aply(self, visibilities, observation, truth):\n        return 2 * visibilities\n"
+    )
+    with pytest.raises(ExperimentError, match="Own defines neither apply nor flags"):
+        validate({"name": "own", "corruption": {"effects": [{"kind": str(path)}]}}, tmp_path)
 
 
 @pytest.mark.parametrize(
