@@ -162,6 +162,13 @@ def _error(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     return arrays[f"{stem}.{own}" if stem else own]
 
 
+def _counting_error(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Return the error of a fraction of the bins that have a result, in all realizations."""
+    stem, found = name.rpartition(".")[0], arrays[name]
+    count = int(arrays[f"{stem}.realizations"]) * np.isfinite(arrays[f"{stem}.unbiased"]).sum()
+    return np.sqrt(found * (1 - found) / count)
+
+
 class UnbiasedFigure(StudyFigure):
     """The spectrum of the residual without its loss, for a signal of any slope.
 
@@ -180,6 +187,7 @@ class UnbiasedFigure(StudyFigure):
     needs_least_squares = True
     tolerances: ClassVar[Rules] = (
         (r"(.*\.)?(measured|by_flat|unbiased|power|signal)", Drawn(_error, "its error")),
+        (r"(.*\.)?within", Drawn(_counting_error, "the error of a count of bins and realizations", 1)),
         (r"(.*\.)?.*error", Drawn(lambda arrays, name: np.abs(arrays[name]), "an error by few realizations", 1)),
     )
 
