@@ -595,7 +595,9 @@ def _plain(value: Any, path: str = "") -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item, path) for item in value]
     if hasattr(value, "unit") and hasattr(value, "value"):
-        return f"{_plain(value.value, path)!r} {value.unit}"
+        if getattr(value, "shape", ()):
+            return [_plain(item, path) for item in value]
+        return f"{_plain(value.value, path)!r} {value.unit}" if str(value.unit) else _plain(value.value, path)
     if hasattr(value, "tolist"):
         return _plain(value.tolist(), path)
     if isinstance(value, PurePath):

@@ -53,6 +53,8 @@ def test_numbers_of_numpy_and_paths_are_plain_ones(file, tmp_path):
     study = calstudy.load(file, **changes)
     assert (study.experiment.instrument.times.count, study.experiment.outputs.runs) == (3, tmp_path)
     assert calstudy.load(file, **{"power.wedge_buffer": 250 * units.ns}).experiment.power.wedge_buffer == 250e-9
+    plain = {"corruption.noise.factor": 3 * units.dimensionless_unscaled, "instrument.times.count": np.int64(3)}
+    assert calstudy.load(file, **plain).experiment.corruption.noise.factor == 3
     content = yaml.safe_load(file.read_text())
     content["instrument"]["times"]["count"] = np.array([3, 4])[0]
     assert calstudy.load(content).experiment.instrument.times.count == 3

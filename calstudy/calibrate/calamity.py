@@ -34,6 +34,7 @@ SEARCH_TOLERANCE, NEAR = 1e-3, 0.1
 Solves to this tolerance move on slowly, and deviations with them, so that these do not settle."""
 QUICK_PASSES = 3
 """Passes after which fits with a finite prior are in double precision: in single, rounding may change weights."""
+NO_EQUAL_SOLVE = "weights from the gains run away, and the fit with equal weights failed"
 NO_EXACT_SOLVE = "only solves with the tolerance of the search for the deviation gave gains"
 UNSETTLED_DEVIATION = "the deviation of the foregrounds from the sky model still changed after"
 UNRESOLVED_DEVIATION = (
@@ -184,14 +185,13 @@ class _Passes:
         current = self._for_pass(problem, gains, deviations)
         done: list[_Pass] = []
         found: Estimate | None = None
-        start, change, anew, fault = warm, 0.0, True, ""
+        start, change, anew, failed = warm, 0.0, True, False
         exact, searched = self._search is self._solver, False
         while len(done) < self._most:
             exact = exact or len(done) == self._most - 1
             solver = self._search if not exact else self._solver if len(done) < QUICK_PASSES else self._late
             solution, warm, anew = _solve(current, solver, warm, anew)
-            if done and not solution.record.usable:
-                fault = NO_EXACT_SOLVE if searched else ""
+            if failed := bool(done) and not solution.record.usable:
                 break
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
             if not solution.record.usable:
@@ -209,9 +209,10 @@ class _Passes:
             far = solution.record.status == "max-steps" or not (found is None or found.resolved)
             if far or (settled and not searched):
                 break
-        ran_away = len(done) > 1 and change > RUNAWAY
-        instead = self._with_equal_weights(problem, start, found and found.deviations) if ran_away else None
-        return self._kept(done, change, found, fault, instead)
+        if change > RUNAWAY and (failed or len(done) > 1):
+            instead = self._with_equal_weights(problem, start, done[0].deviations)
+            return self._kept(done, change, found, "" if instead else NO_EQUAL_SOLVE, instead)
+        return self._kept(done, change, found, NO_EXACT_SOLVE if failed and searched else "")
 
     def _with_equal_weights(
         self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
@@ -243,7 +244,7 @@ class _Passes:
 
         A `fault` makes a converged pass a stalled one.
         """
-        kept = instead or done[-1]
+        kept = instead or done[0 if change > RUNAWAY else -1]
         record = _together([one.solution.record for one in (*done, *([instead] if instead else []))])
         if fault and record.status == "converged":
             record = replace(record, status="stalled", message=fault)

@@ -24,7 +24,7 @@ from calstudy.calibrate.problem import (
     repeat_structure,
 )
 from calstudy.calibrate.records import Solve, require_parallel_hands
-from calstudy.calibrate.settings import START_DEVIATION, ForegroundFit, GainFit, GainWeights, RedundantStart
+from calstudy.calibrate.settings import RUNAWAY, START_DEVIATION, ForegroundFit, GainFit, GainWeights, RedundantStart
 from calstudy.calibrate.weights import inverse_variances, make_weights
 from calstudy.instrument.layouts import redundant_groups
 
@@ -114,8 +114,8 @@ def problem_at(
 ) -> CalibrationProblem | str:
     """Return the problem whose solution are gains (Nants, Nfreqs), or why there is none.
 
-    Weights that come from the gains are those of these gains. Deviations of the foregrounds that were estimated are
-    those in the record of the solve.
+    Weights that come from the gains are those of these gains, or equal if those of the solve ran away. Deviations of
+    the foregrounds that were estimated are those in the record of the solve.
     """
     problem = make_problem(prepared, settings, times, polarization)
     if isinstance(problem, str):
@@ -124,7 +124,10 @@ def problem_at(
         if record is None:
             raise ValueError("record: is needed where the deviations of the foregrounds are estimated")
         problem = problem.with_fractions(record.diagnostics.get("deviation", problem.fractions))
-    return problem.weighted_by(gains) if isinstance(settings.weights, GainWeights) else problem
+    if not isinstance(settings.weights, GainWeights):
+        return problem
+    ran_away = record is not None and record.diagnostics.get("weight_change", 0) > RUNAWAY
+    return problem.weighted_by(np.ones_like(gains) if ran_away else gains)
 
 
 def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polarization: int) -> CalibrationProblem | str:

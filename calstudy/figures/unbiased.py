@@ -163,10 +163,12 @@ def _error(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _counting_error(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """Return the error of a fraction of the bins that have a result, in all realizations."""
-    stem, found = name.rpartition(".")[0], arrays[name]
-    count = int(arrays[f"{stem}.realizations"]) * np.isfinite(arrays[f"{stem}.unbiased"]).sum()
-    return np.sqrt(found * (1 - found) / count)
+    """Return the error of a fraction of bins with a result, in all realizations, as if they were independent."""
+    stem = name.removesuffix("within")
+    count = int(arrays[f"{stem}realizations"]) * np.isfinite(arrays[f"{stem}unbiased"]).sum()
+    # Not zero for none and all.
+    part = (count * arrays[name] + 1) / (count + 2)
+    return np.sqrt(part * (1 - part) / count)
 
 
 class UnbiasedFigure(StudyFigure):

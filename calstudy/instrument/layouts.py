@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 FARTHEST, SMALLEST = 3e6, 1.0
-"""Largest coordinate of an antenna, which geocentric ones exceed, and smallest width of an array, m."""
+"""Largest coordinate of an antenna, which geocentric ones exceed, and smallest width of three antennas or more, m."""
 NEARBY = 1.0
 """deg, by which a site may differ from the mean of the positions of its antennas."""
 
@@ -200,12 +200,15 @@ def make_layout(settings: Plugin) -> Layout:
     with guarded(layout):
         made = layout.make()
         again = made if type(layout).__module__.startswith("calstudy.") else layout.make()
-    if not isinstance(made, Layout):
-        raise InputError(f"{layout.origin}: make returned {made!r}; a Layout is needed, such as self.flat(positions)")
+    for one in (made, again):
+        if not isinstance(one, Layout):
+            raise InputError(
+                f"{layout.origin}: make returned {one!r}; a Layout is needed, such as self.flat(positions)"
+            )
     _require_valid(made, layout.origin)
-    if not np.array_equal(made.enu, again.enu):
+    if not all(np.array_equal(getattr(made, name), getattr(again, name)) for name in ("numbers", "names", "enu")):
         raise InputError(
-            f"{layout.origin}: make gives other positions at every call, and each product would be of another array; "
+            f"{layout.origin}: make gives other antennas at every call, and each product would be of another array; "
             "draw them with a seed that is a field"
         )
     return made
@@ -222,7 +225,7 @@ def _require_valid(made: Layout, origin: str) -> None:
         raise InputError(f"{origin}: antenna numbers (>= 0) and names must be unique")
     if not np.isfinite(made.enu).all():
         raise InputError(f"{origin}: positions must be finite")
-    if np.abs(made.enu).max() > FARTHEST or np.ptp(made.enu, axis=0).max() < SMALLEST:
+    if np.abs(made.enu).max() > FARTHEST or (count > 2 and np.ptp(made.enu, axis=0).max() < SMALLEST):
         raise InputError(
             f"{origin}: antennas are up to {np.abs(made.enu).max():.4g} m from the origin, and the array is "
             f"{np.ptp(made.enu, axis=0).max():.4g} m wide; give east, north and up of a place in the array, in metres, "

@@ -134,7 +134,7 @@ class OfSolves(Calibrated):
             elif isinstance(problem, str):
                 found = problem
             elif solve.diagnostics.get("weight_change", 0) > RUNAWAY:
-                # The gains are those of an earlier pass, whose weights are not known.
+                # Weights are equal then, and not the inverse variances.
                 found = RAN_AWAY
             else:
                 model = cube[times, :, :, place].reshape(problem.visibilities.shape)

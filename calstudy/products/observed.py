@@ -182,7 +182,7 @@ class Observe(Task, stage="observe", version=4):
         if self.sky_model is not None:
             alone = Selection(polarizations=selection.polarizations)
             sky, sky_notes = self._prepared(read_visibilities([self.sky_model]), alone)
-            if str(sky.vis_units).lower() not in ("jy", "uncalib", str(data.vis_units).lower()):
+            if str(sky.vis_units).lower() not in ("jy", "uncalib"):
                 raise InputError(f"sky model: is in {sky.vis_units!r}, and must be in Jy; convert it first")
             sky, data, left_out = common_baselines(sky, data, bool(self.autos))
             notes += [f"Sky model: {note}" for note in sky_notes] + left_out

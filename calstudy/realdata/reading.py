@@ -148,7 +148,8 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
         data.flag_array |= bad
         notes.append(f"{bad.sum()} samples are not finite (NaN or infinite) and were flagged.")
     none = (data.nsample_array == 0) & ~data.flag_array
-    if none.any():
+    # Programs that do not count samples leave all numbers at zero.
+    if none.any() and data.nsample_array.any():
         data.flag_array |= none
         notes.append(f"{none.sum()} samples are of no measurement (nsamples of 0) and were flagged.")
     for note in notes:

@@ -212,6 +212,7 @@ class InjectionSettings(Section):
     eor: Eor = Field(Eor(nside=128), description="As `sky.eor` of an experiment.")
     level: Decibel | None = Field(
         -30.0,
+        le=0.0,
         description="rms of the EoR over that of the fitted foregrounds, 10 log10 of brightness: -30 dB is 1e-3; null: "
         "as `eor` says.",
     )

@@ -13,6 +13,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import import_module
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -241,7 +242,7 @@ class Budget:
     strict: bool = False
 
     def __post_init__(self) -> None:
-        if self.workers is not None and (not isinstance(self.workers, int) or self.workers < 1):
+        if self.workers is not None and not (isinstance(self.workers, Integral) and self.workers >= 1):
             raise InputError(
                 f"workers = {self.workers!r}: must be a whole number of at least 1, or None for one per core"
             )

@@ -144,6 +144,22 @@ def test_scale_and_band_shape_against_the_sky_model_are_told(command, finished, 
     assert all(record["diagnostics"]["sky_model_slope"] == pytest.approx(1) for record in records)
 
 
+def test_a_sky_model_in_kelvin_and_gains_of_zero_are_refused(command, finished, data, tmp_path):
+    """Either would be taken for something else, and give results without a word."""
+    sky = UVData.from_file(str(finished[0] / "out" / "model.uvh5"))
+    sky.vis_units = "K str"
+    sky.write_uvh5(str(tmp_path / "kelvin.uvh5"))
+    code, error = command(data, *OPTIONS, "--output", "out", "--sky-model", "kelvin.uvh5")
+    assert code == 2
+    assert "sky model: is in 'K str', and must be in Jy" in error
+    gains = UVCal.from_file(str(finished[0] / "out" / "gains.calh5"))
+    gains.gain_array *= 0
+    gains.write_calh5(str(tmp_path / "zero.calh5"))
+    code, error = command(data, *OPTIONS, "--output", "out", "--gains", "zero.calh5")
+    assert code == 2
+    assert "gains: all are zero or not finite" in error
+
+
 def test_the_size_of_the_errors_of_the_sky_model_is_told(command, finished, data, tmp_path):
     """A model with a tenth more flux on every other baseline, and a tenth less on the others."""
     sky = UVData.from_file(str(finished[0] / "out" / "model.uvh5"))

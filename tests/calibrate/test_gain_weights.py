@@ -16,7 +16,9 @@ from toy_data import SETTINGS, make_uvdata, sky_of
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import flag_cube, to_cube
+from calstudy.calibrate import calamity
 from calstudy.calibrate.basis import dpss_vectors
+from calstudy.calibrate.calamity import make_solver
 from calstudy.calibrate.calibrators.least_squares import Calamity, SkyBased
 from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.calibrators.redcal import Redcal
@@ -24,7 +26,9 @@ from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import make_problem, prepare, problem_at
 from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
+from calstudy.calibrate.records import Solve
 from calstudy.calibrate.settings import BaselineRange, FlagWeights, GainWeights
+from calstudy.calibrate.solvers.interface import Solution, WarmStart
 from calstudy.calibrate.tangent_space import TangentSpace
 from calstudy.power.delay import delay_transform
 
@@ -241,3 +245,35 @@ def test_antennas_without_any_weight_in_a_taper_are_flagged(name):
     assert not flags[~last].any()
     residual = to_cube(result.residual)[0, :, :, 0]
     assert np.abs(residual[~last]).max() < 1e-5 * np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+
+
+def noisy(seed: int) -> np.ndarray:
+    """Return gains that are lost in noise."""
+    return 10.0 ** np.random.default_rng(seed).normal(size=(8, 64)).astype(complex)
+
+
+@pytest.mark.parametrize(("fails", "kept", "status"), [("second", "equal", "max-steps"), ("equal", "first", "stalled")])
+def test_where_weights_run_away_and_a_pass_fails(monkeypatch, fails, kept, status):
+    """Solves are stubs, whose gains are lost in noise but with equal weights."""
+    toy = make_toy(scattered(8), noise=0.1)
+    uvd = make_uvdata(toy, n_times=1)
+    settings = Calamity(weights=GainWeights(), prior="gains")
+    problem = make_problem(prepare(Observation(uvd), settings), settings, slice(0, 1), 0)
+    start = noisy(0)
+    equal = problem.weighted_by(np.ones_like(toy.gains)).weights
+    calls = []
+
+    def stub(current, solver, warm, anew):
+        is_equal = np.array_equal(current.weights, equal)
+        calls.append("equal" if is_equal else "pass")
+        failing = (fails == "equal") if is_equal else (fails == "second" and calls.count("pass") == 2)
+        gains = np.ones_like(start) if is_equal else noisy(len(calls))
+        losses, ended = np.array([1.0, 0.5]), "failed" if failing else "converged"
+        record = Solve(ended, "", steps=1, loss_history=losses, seconds=0.0, cpu_seconds=0.0)
+        return Solution(gains, problem.visibilities, record), warm, anew
+
+    monkeypatch.setattr(calamity, "_solve", stub)
+    found = calamity._Passes(settings, make_solver(settings), (0, 0)).solve(problem, WarmStart(start, None), None)
+    assert calls[-1] == "equal"
+    assert found.solution.record.status == status
+    assert np.array_equal(found.solution.gains, np.ones_like(start) if kept == "equal" else noisy(1))

@@ -104,8 +104,8 @@ print(usage.peak_memory)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("antennas", [36, 96])
-def test_what_is_planned_is_what_it_takes(antennas):
+@pytest.mark.parametrize(("antennas", "above"), [(36, 1.7), (96, 1.5)])
+def test_what_is_planned_is_what_it_takes(antennas, above):
     """In a process of its own, whose memory is that of one cold solve.
 
     Plans are for workers, which keep what earlier work left: 1.4 to 2.0 GB in studies of 36 antennas, where 1.5 GB are
@@ -114,7 +114,7 @@ def test_what_is_planned_is_what_it_takes(antennas):
     command = [sys.executable, "-c", MEASURE, str(antennas)]
     measured = int(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
     planned = solve_memory(Dimensions.of(Simulation(Case(antennas=antennas)).structure()), DEFAULT)
-    assert planned / 1.7 < measured < 1.5 * planned
+    assert planned / above < measured < 1.5 * planned
 
 
 def test_dimensions_are_those_of_the_structure():

@@ -66,6 +66,9 @@ def test_samples_of_no_measurement_are_flagged_and_counted(data):
     prepared, notes = prepare(data)
     assert prepared.flag_array[5, 3].all()
     assert notes == ["1 samples are of no measurement (nsamples of 0) and were flagged."]
+    # Where none is counted, nothing is known.
+    data.nsample_array[:] = 0
+    assert prepare(data)[1] == []
 
 
 def test_values_that_are_not_finite_are_flagged_and_counted(data):

@@ -121,6 +121,9 @@ class Few(Effect):
     def refusal(self, size):
         if size.antennas > self.most:
             return f"most: {size.antennas} antennas are too many; at most {self.most}"
+
+    def apply(self, visibilities, observation, truth):
+        return visibilities
 """
     (tmp_path / "few.py").write_text(code)
     data = override(tiny(tmp_path), "corruption.effects", [{"kind": "few.py"}])

@@ -205,7 +205,7 @@ def test_positions_in_degrees_are_compared_with_the_site(tmp_path):
         ("number,east_m,north_m,up_m\n1,0,0,0\n1,1,0,0\n", "unique"),
         ("east_m,north_m,up_m\n0,0,0\n1,nan,0\n", "finite"),
         # Kilometres, and geocentric coordinates of HERA.
-        ("east_m,north_m,up_m\n0,0,0\n0.014,0,0\n", "in metres"),
+        ("east_m,north_m,up_m\n0,0,0\n0.014,0,0\n0,0.014,0\n", "in metres"),
         ("east_m,north_m,up_m\n5109325,2006835,-3238948\n5109339,2006835,-3238948\n", "centre of the Earth"),
     ],
 )

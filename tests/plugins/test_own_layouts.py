@@ -62,7 +62,7 @@ def test_it_decides_what_is_simulated(plugged):
         ("return self.flat(np.zeros((1, 2)))", "at least two antennas are needed"),
         ("return self.flat(np.array([[0, 0], [9, 0], [0, 0.0]]))", "are in the same place"),
         ("self.flat(np.eye(2))", "make returned None; a Layout is needed"),
-        ("return self.flat(np.random.default_rng().normal(0, 30, (7, 2)))", "other positions at every call"),
+        ("return self.flat(np.random.default_rng().normal(0, 30, (7, 2)))", "other antennas at every call"),
         ("return 1 / 0", r"own\.py line 6, in make: ZeroDivisionError"),
     ],
 )
