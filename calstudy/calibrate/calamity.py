@@ -217,9 +217,9 @@ class _Passes:
     def _with_equal_weights(
         self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
     ) -> _Pass | None:
-        """Solve with the weights of unity gains, which do not depend on gains that are lost in noise; None if it fails.
+        """Solve with the weights of unity gains; None if the solve fails.
 
-        Those of the first pass may: they are of the gains of the integration before.
+        The first pass is no fallback: its weights come from the gains of the integration before, which may be noise.
         """
         equal = self._for_pass(problem, np.ones_like(problem.initial_gains), deviations)
         solution, warm, _ = _solve(equal, self._solver, warm, True)

@@ -232,7 +232,7 @@ class Experiment(Section):
             raise fault(
                 "power.wedge_buffer",
                 f"is {1e6 * self.power.wedge_buffer:g} us, and delays reach {1e6 * reach:.4g} us with channels of this "
-                "width, so that no mode is outside the wedge",
+                "width, so that no mode is outside the wedge; give a smaller one, or narrower channels",
             )
         return self
 

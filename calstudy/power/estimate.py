@@ -46,7 +46,6 @@ class DiagonalPSpecData(PSpecData):
         """Delete all matrices."""
         super().clear_cache(keys)
         self._made: dict[tuple, np.ndarray] = {}
-        self._weights: dict[tuple, np.ndarray] = {}
         self._latest: dict[str, tuple] = {}
 
     def validate_pol(self, dsets: tuple[int, int], pol_pair: tuple[int, int]) -> bool:
@@ -133,9 +132,7 @@ class DiagonalPSpecData(PSpecData):
         return self._shared(("spectrum", self.taper, self.symmetric_taper, key), transform)
 
     def _flag_weights(self, key: tuple) -> np.ndarray:
-        if key not in self._weights:
-            self._weights[key] = self.w(key).max(axis=1)
-        return self._weights[key]
+        return self.w(key).max(axis=1)
 
     def _once(self, name: str, G: np.ndarray, H: np.ndarray, build: Callable[[], Any]) -> Any:
         """Return the result of `build`, computed again only if G or H is another array than at the last call."""
