@@ -15,7 +15,7 @@ from calstudy.sky.settings import SyntheticSources
 
 @pytest.mark.slow
 def test_the_dense_engine_agrees_with_pyuvsim_on_the_whole_default_sky(embedded_beam):
-    template = observe(count=36, channels=2, width="20 MHz", times=2, integration="110 s", polarizations=("xx",))
+    template = observe(count=36, channels=2, width="10 MHz", times=2, integration="110 s", polarizations=("xx",))
     sky = make_foregrounds(SyntheticSources(), template.freq_array).sky
     assert sky.Ncomponents > 200_000
     for time, frequency in zip(template.time_array[:: template.Nbls], template.freq_array, strict=True):
