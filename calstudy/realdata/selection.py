@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.errors import InputError
 from calstudy.base.units import parse_quantity
+from calstudy.base.visibilities import polarization_names
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -164,18 +165,13 @@ def _antenna(data: UVData, name: str) -> int:
 
 
 def _polarization(data: UVData, name: str) -> int:
-    from pyuvdata.utils import polnum2str
-
-    numbers = {}
-    for number in data.polarization_array:
-        numbers[polnum2str(int(number)).lower()] = int(number)
+    numbers = {polarization_names([number]): int(number) for number in data.polarization_array}
     for shown, number in zip(data.get_pols(), list(data.polarization_array), strict=True):
         numbers[shown.lower()] = int(number)
     if data.telescope.feed_array is None:
         # Old files lack the orientation of their feeds; x is taken to be east, as in calibration.
         numbers |= {east: numbers[x] for east, x in (("ee", "xx"), ("nn", "yy")) if x in numbers}
     if name.lower() not in numbers:
-        raise InputError(
-            f"--select polarizations: {name!r} is not in the data, which have {', '.join(data.get_pols())}"
-        )
+        present = polarization_names(data.polarization_array)
+        raise InputError(f"--select polarizations: {name!r} is not in the data, which have {present}")
     return numbers[name.lower()]

@@ -234,7 +234,7 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
     code, error = command(data, *OPTIONS, "--set", "solver.max_steps=1", "--output", "out")
     assert code == 3
     assert "2 of 2 solves did not converge" in error
-    assert "integration 1, polarization -5: max-steps, not converged after 1 steps" in error
+    assert "integration 1, polarization xx: max-steps, not converged after 1 steps" in error
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def test_cross_hands_are_left_out_and_told(toy):
     crossed.check()
     prepared, notes = prepare(both + crossed)
     assert list(prepared.polarization_array) == [-5, -6]
-    assert notes == ["Polarizations en, ne are not calibrated."]
+    assert notes == ["Polarizations xy, yx are not calibrated."]
     with pytest.raises(InputError, match="no parallel hands"):
         prepare(crossed)
 
@@ -170,7 +170,7 @@ def test_channels_at_the_ends_are_selected(data):
         ("times=a..b", "not a whole number"),
         ("frequencies=100..200", "has no unit"),
         ("antennas=999", "'999' is not in the data"),
-        ("polarizations=xy", "not in the data, which have ee"),
+        ("polarizations=xy", "not in the data, which have xx"),
         ("times=50..", "no integrations in this range"),
         ("lengths=900 m..", "no baselines"),
     ],
