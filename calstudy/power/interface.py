@@ -138,8 +138,8 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
     hands = polarization_names(even.polarization_array)
     if with_data and not pairs:
         raise InputError(
-            f"power.coherent_time: every block lacks one of the polarizations {hands}, flagged altogether; a longer time "
-            "may help, or a selection of one polarization"
+            f"power.coherent_time: every block lacks one of the polarizations {hands}, flagged altogether; a longer "
+            "time may help, or a selection of one polarization"
         )
     if len(pairs) < len(with_data):
         lacking = len(with_data) - len(pairs)
