@@ -171,8 +171,11 @@ def test_channels_at_the_ends_are_selected(data):
         ("frequencies=100..200", "has no unit"),
         ("antennas=999", "'999' is not in the data"),
         ("polarizations=xy", "not in the data, which have xx"),
-        ("times=50..", "no integrations in this range"),
-        ("lengths=900 m..", "no baselines"),
+        ("times=50..", "no integrations in this range; the data have 0 to 2"),
+        ("times=-1..", "not a whole number of at least 0"),
+        ("times=2..1", "exchange them"),
+        ("frequencies=1 MHz..2 MHz", r"no channels in this range; the data have 160 MHz to 185\.2 MHz"),
+        ("lengths=900 m..", r"no baselines in this range; the data have [\d.]+ m to [\d.]+ m"),
     ],
 )
 def test_bad_selections_are_one_sentence(data, text, match):
