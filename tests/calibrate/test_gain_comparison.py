@@ -167,7 +167,7 @@ def test_files_that_have_nothing_in_common_are_refused(template, gains):
         pair_gains(left, right)
     other = cal.copy()
     other.jones_array = np.array([-6])
-    with pytest.raises(InputError, match="0 feed.* in common.*: the first has gains of xx, the second of yy"):
+    with pytest.raises(InputError, match=r"0 feed.* in common.*: the first has gains of xx, the second of yy"):
         pair_gains(cal, other)
 
 
