@@ -7,12 +7,15 @@ import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from command_line import run_command
 from jsonschema import Draft202012Validator
+from pyuvdata import UVData
 from tiny import tiny
 
+from calstudy.base.errors import InputError
 from calstudy.base.package_files import experiment_names, published
 from calstudy.cli import main as cli
 from calstudy.experiment.files import dump, override, parse_yaml, validate
@@ -292,6 +295,18 @@ def test_a_path_is_written_as_yaml_reads_it(here, capsys):
     (here / "a's #1.uvh5").symlink_to(data)
     output_of(capsys, "init", "mine", "--data", "a's #1.uvh5")
     assert parse_yaml((here / "mine.yaml").read_text(), "mine")["observed"]["data"] == "a's #1.uvh5"
+
+
+def test_no_file_is_written_about_one_integration(here, capsys):
+    """It has no halves, and no plan of the file would go through."""
+    import hera_qm
+
+    data = UVData.from_file(Path(hera_qm.__file__).parent / "data" / "zen.2457698.40355.xx.HH.uvh5")
+    data.select(times=np.unique(data.time_array)[:1])
+    data.write_uvh5("one.uvh5")
+    with pytest.raises(InputError, match=r"--data: one.uvh5 has 1 integration, and a study needs two"):
+        output_of(capsys, "init", "mine", "--data", "one.uvh5")
+    assert not (here / "mine.yaml").exists()
 
 
 def test_a_file_about_measured_data_is_valid_and_names_their_band(here, capsys, schema):

@@ -14,7 +14,7 @@ import numpy as np
 
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import antenna_pairs, positions
+from calstudy.base.visibilities import antenna_pairs, polarization_names, positions
 
 SAME_CHANNEL = 0.1
 """Channels of two files are the same if they differ by less than this, in units of their width."""
@@ -226,7 +226,7 @@ def solutions(
     """
     for pol in polarizations:
         if pol not in cal.jones_array:
-            raise InputError(f"gains: no solution for polarization {int(pol)} (AIPS number) of the data")
+            raise InputError(f"gains: no solution for polarization {polarization_names([pol])} of the data")
     rows, feeds = positions(cal.ant_array, numbers), positions(cal.jones_array, polarizations)
     channels = np.abs(cal.freq_array[None] - frequencies[:, None]).argmin(axis=1)
     gains, flags = (array[rows][:, channels][..., feeds] for array in (cal.gain_array, cal.flag_array))

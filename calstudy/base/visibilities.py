@@ -6,6 +6,7 @@ integration, then of the second, and so on). The functions here check that and r
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING
@@ -91,6 +92,13 @@ def positions(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return the index in `values`, unique and in any order, (N,), of each of `wanted`, in the shape of `wanted`."""
     order = np.argsort(values)
     return order[np.searchsorted(values, wanted, sorter=order)]
+
+
+def polarization_names(numbers: Iterable[int]) -> str:
+    """Return polarizations for a message, such as "xx, yy"."""
+    from pyuvdata.utils import polnum2str
+
+    return ", ".join(polnum2str(int(number)).lower() for number in numbers)
 
 
 def rows_of(uvd: UVData, pairs: np.ndarray) -> list[int]:

@@ -19,6 +19,7 @@ from calstudy.calibrate.problem import CalibrationProblem, FitStructure, repeat_
 from calstudy.calibrate.records import Solve
 from calstudy.calibrate.settings import (
     RUNAWAY,
+    FlagWeights,
     GainFit,
     GainWeights,
     GaussNewtonSettings,
@@ -164,12 +165,13 @@ class _Passes:
     """
 
     def __init__(self, settings: GainFit, solver: Solver, seed: tuple[int, int]) -> None:
+        self._settings = settings
         self._weights = settings.weights if isinstance(settings.weights, GainWeights) else None
         self._estimated, self._solver, self._seed = settings.estimates_deviation, solver, seed
         self._late = replace(solver, patience=0) if isinstance(solver, GaussNewton) else solver
         exact = not self._estimated or solver.tolerance >= SEARCH_TOLERANCE
         self._search = solver if exact else make_solver(settings, SEARCH_TOLERANCE)
-        passes = 0 if self._weights is None else self._weights.passes
+        passes = 1 if self._weights is None else self._weights.passes
         self._most = max(passes, PASSES) if self._estimated else passes
 
     def solve(
@@ -211,20 +213,21 @@ class _Passes:
                 break
         if change > RUNAWAY and (failed or len(done) > 1):
             instead = self._with_equal_weights(problem, start, done[0].deviations)
-            return self._kept(done, change, found, "" if instead else NO_EQUAL_SOLVE, instead)
+            # The record of what is kept instead has its own deviations.
+            return self._kept(done, change, None if instead else found, "" if instead else NO_EQUAL_SOLVE, instead)
         return self._kept(done, change, found, NO_EXACT_SOLVE if failed and searched else "")
 
     def _with_equal_weights(
         self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
     ) -> _Pass | None:
-        """Solve with the weights of unity gains; None if the solve fails.
+        """Solve with the weights of unity gains, and deviations that these solves estimate; None if the solve fails.
 
         The first pass is no fallback: its weights come from the gains of the integration before, which may be noise.
         """
-        equal = self._for_pass(problem, np.ones_like(problem.initial_gains), deviations)
-        solution, warm, _ = _solve(equal, self._solver, warm, True)
-        used = equal.fractions if self._estimated else None
-        return _Pass(solution, warm, used) if solution.record.usable else None
+        equal = self._for_pass(problem, np.ones_like(problem.initial_gains), None)
+        settings = self._settings.model_copy(update={"weights": FlagWeights()})
+        found = _Passes(settings, self._solver, self._seed).solve(equal, warm, deviations)
+        return found if found.solution.record.usable else None
 
     def _for_pass(
         self, problem: CalibrationProblem, gains: np.ndarray, deviations: tuple[float, float] | None
@@ -254,8 +257,7 @@ class _Passes:
         if self._weights is not None:
             notes["weight_change"] = change
         if found is not None and kept.deviations is not None:
-            error = found.error if instead is None else (None, None)
-            notes |= {"deviation": list(kept.deviations), "deviation_error": list(error)}
+            notes |= {"deviation": list(kept.deviations), "deviation_error": list(found.error)}
             if not found.resolved:
                 record = replace(record, status="stalled", message=UNRESOLVED_DEVIATION)
             elif not found.settled and record.status == "converged":

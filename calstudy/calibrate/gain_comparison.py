@@ -23,7 +23,7 @@ from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile, known_gains, solution_times
-from calstudy.base.visibilities import positions
+from calstudy.base.visibilities import polarization_names, positions
 from calstudy.calibrate.agreement import LIMITS, TAPER, aligned_gains
 from calstudy.calibrate.basis import ChannelGrid
 from calstudy.calibrate.degeneracy import fix_phase
@@ -138,7 +138,11 @@ def pair_gains(
     if not numbers.size:
         raise InputError("the two files have no antenna in common")
     if polarization >= len(feeds):
-        raise InputError(f"the two files have {len(feeds)} feed(s) in common; there is no number {polarization}")
+        has = [polarization_names(cal.jones_array) for cal in (first, second)]
+        raise InputError(
+            f"the two files have {len(feeds)} feed(s) in common, and there is no number {polarization}: the first has "
+            f"gains of {has[0]}, the second of {has[1]}"
+        )
     frequencies = [np.sort(np.ravel(cal.freq_array)) for cal in (first, second)]
     width = float(np.min(first.channel_width))
     if len(frequencies[0]) != len(frequencies[1]) or np.abs(np.subtract(*frequencies)).max() > SAME_CHANNEL * width:

@@ -11,7 +11,7 @@ import numpy as np
 from calstudy.base.errors import InputError
 from calstudy.base.files import json_number
 from calstudy.base.gains import make_uvcal
-from calstudy.base.visibilities import from_cube, positions
+from calstudy.base.visibilities import from_cube, polarization_names, positions
 
 if TYPE_CHECKING:
     from pyuvdata import UVCal, UVData
@@ -158,9 +158,8 @@ class CalibrationResult:
 def require_parallel_hands(data: UVData) -> None:
     """Raise InputError unless all polarizations are xx, yy, rr or ll."""
     if not np.isin(data.polarization_array, list(PARALLEL_HANDS)).all():
-        raise InputError(
-            f"polarizations: {', '.join(data.get_pols())}; calibration takes {', '.join(PARALLEL_HANDS.values())} only"
-        )
+        found, taken = map(polarization_names, (data.polarization_array, PARALLEL_HANDS))
+        raise InputError(f"polarizations: {found}; calibration takes {taken} only")
 
 
 def make_gains(data: UVData, numbers: np.ndarray, gains: np.ndarray, flags: np.ndarray) -> UVCal:

@@ -9,7 +9,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.visibilities import from_cube, positions, to_cube
+from calstudy.base.visibilities import from_cube, polarization_names, positions, to_cube
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -108,7 +108,8 @@ def match_sky_model(sky: UVData, data: UVData) -> UVData:
     if None in channels:
         raise InputError("sky model: lacks channels of the data")
     if not np.isin(data.polarization_array, sky.polarization_array).all():
-        raise InputError(f"sky model: has polarizations {', '.join(sky.get_pols())}, data {', '.join(data.get_pols())}")
+        has, needs = (polarization_names(uvd.polarization_array) for uvd in (sky, data))
+        raise InputError(f"sky model: has polarizations {has}, data {needs}")
     rows = np.isin(sky.baseline_array, wanted) & np.isin(sky.time_array, sky.time_array[times])
     sky.select(blt_inds=np.flatnonzero(rows), freq_chans=channels, polarizations=data.polarization_array)
     sky.reorder_pols(order=positions(sky.polarization_array, data.polarization_array), run_check=False)

@@ -249,6 +249,7 @@ def _about_the_sky_model(diagnostics: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _status(records: Sequence[Mapping[str, Any]]) -> int:
     """Print the solves that did not converge to standard error; return the exit status."""
+    from calstudy.base.visibilities import polarization_names
     from calstudy.calibrate.records import SETTLED
 
     unconverged = [record for record in records if record["status"] not in SETTLED]
@@ -257,8 +258,8 @@ def _status(records: Sequence[Mapping[str, Any]]) -> int:
     typer.echo(f"calstudy: {len(unconverged)} of {len(records)} solves did not converge:", err=True)
     for record in unconverged[:NAMED]:
         typer.echo(
-            f"calstudy: integration {record['integration']}, polarization {record['polarization']}: "
-            f"{record['status']}, {record['message']}",
+            f"calstudy: integration {record['integration']}, polarization "
+            f"{polarization_names([record['polarization']])}: {record['status']}, {record['message']}",
             err=True,
         )
     if len(unconverged) > NAMED:

@@ -90,6 +90,11 @@ def _described(data: str) -> dict[str, str]:
         facts = read_facts((find_data(data, Path()),), Selection(), even=False)
     except InputError as error:
         raise InputError(f"--data: {error}") from None
+    if facts.times.size < 2:
+        raise InputError(
+            f"--data: {data} has 1 integration, and a study needs two, for even and odd; join it with others of the "
+            "same night, or calibrate it alone with `calstudy calibrate`"
+        )
     first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
     return {
         "path": data if PLAIN_PATH.fullmatch(data) else json.dumps(data, ensure_ascii=False),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -221,8 +222,10 @@ def _require_valid(made: Layout, origin: str) -> None:
             f"{origin} has {count} numbers, {len(made.names)} names and positions of shape {shape}; at least two "
             "antennas are needed, each with a number, a name and east, north, up"
         )
-    if len(set(made.numbers.tolist())) < count or len(set(made.names)) < count or made.numbers.min() < 0:
-        raise InputError(f"{origin}: antenna numbers (>= 0) and names must be unique")
+    numbers, names = made.numbers.tolist(), list(made.names)
+    twice = [value for found in (numbers, names) for value, times in Counter(found).items() if times > 1]
+    if bad := [number for number in numbers if number < 0] + twice:
+        raise InputError(f"{origin}: antenna numbers (>= 0) and names must be unique; see '{bad[0]}'")
     if not np.isfinite(made.enu).all():
         raise InputError(f"{origin}: positions must be finite")
     if np.abs(made.enu).max() > FARTHEST or (count > 2 and np.ptp(made.enu, axis=0).max() < SMALLEST):

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
+from calstudy.base.visibilities import polarization_names
 from calstudy.power.binned import independent_times
 from calstudy.power.delay import TAPERS
 from calstudy.power.settings import ESTIMATORS, PowerSettings
@@ -134,10 +135,11 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
     every = [(_integration(even, number), _integration(odd, number)) for number in range(even.Ntimes)]
     with_data = [pair for pair in every if not any(uvd.flag_array.all() for uvd in pair)]
     pairs = [pair for pair in with_data if not any(uvd.flag_array.all(axis=(0, 1)).any() for uvd in pair)]
+    hands = polarization_names(even.polarization_array)
     if with_data and not pairs:
         raise InputError(
-            f"power.coherent_time: every block lacks one of the polarizations {', '.join(even.get_pols())}, flagged "
-            "altogether; a longer time may help, or a selection of one polarization"
+            f"power.coherent_time: every block lacks one of the polarizations {hands}, flagged altogether; a longer "
+            "time may help, or a selection of one polarization"
         )
     if len(pairs) < len(with_data):
         lacking = len(with_data) - len(pairs)
@@ -150,7 +152,7 @@ def _blocks(even: UVData, odd: UVData) -> list[tuple[UVData, UVData]]:
     if missing.any(axis=1).all() and len(pairs) > 1:
         raise InputError(
             "power.coherent_time: every baseline is flagged altogether in one of the blocks, in one of the "
-            f"polarizations {', '.join(even.get_pols())}; a longer time may help"
+            f"polarizations {hands}; a longer time may help"
         )
     return pairs
 

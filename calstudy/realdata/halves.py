@@ -16,6 +16,7 @@ import numpy as np
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
+from calstudy.base.visibilities import polarization_names
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.settings import Channels, Size
 from calstudy.realdata.selection import SAME_FREQUENCY, Selection, between, parse_values, select
@@ -244,7 +245,7 @@ def require_same_sky(even: Facts, odd: Facts, sky_model: Path | None = None) -> 
             "same duration, which see the same sky"
         )
     if odd.polarizations != even.polarizations:
-        names = [", ".join(PARALLEL_HANDS[number] for number in facts.polarizations) for facts in (odd, even)]
+        names = [polarization_names(facts.polarizations) for facts in (odd, even)]
         raise InputError(
             f"observed.odd: has the polarizations {names[0]} and observed.data {names[1]}; give both the same in the "
             "same order, for example by observed.select.polarizations"
@@ -312,8 +313,8 @@ def east_and_north(data: UVData) -> list[str]:
         telescope.set_feeds_from_x_orientation("east", feeds=["x", "y"], polarization_array=data.polarization_array)
         return ["The file calls the northern feed x; it is called y here, and the eastern one x."]
     raise InputError(
-        f"observed.data: polarizations {', '.join(data.get_pols())} of feeds that are not linear and to the east and "
-        "north; power spectra need such, for the beam is that of such feeds"
+        f"observed.data: polarizations {polarization_names(data.polarization_array)} of feeds that are not linear and "
+        "to the east and north; power spectra need such, for the beam is that of such feeds"
     )
 
 

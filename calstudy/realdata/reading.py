@@ -21,7 +21,7 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gain_files import CASACORE
-from calstudy.base.visibilities import keep_compiled_pyuvdata
+from calstudy.base.visibilities import keep_compiled_pyuvdata, polarization_names
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.array_layouts.csv import read_positions
 from calstudy.instrument.layouts import make_layout
@@ -162,13 +162,12 @@ def _keep_parallel_hands(data: UVData, notes: list[str]) -> None:
     wanted = np.isin(numbers, list(PARALLEL_HANDS))
     if not wanted.any():
         raise InputError(
-            f"data: polarizations {', '.join(data.get_pols())} have no parallel hands of feeds "
+            f"data: polarizations {polarization_names(data.polarization_array)} have no parallel hands of feeds "
             f"({', '.join(PARALLEL_HANDS.values())}), which have gains"
         )
     if not wanted.all():
-        dropped = [name for name, keep in zip(data.get_pols(), wanted, strict=True) if not keep]
         data.select(polarizations=numbers[wanted], run_check=False)
-        notes.append(f"Polarizations {', '.join(dropped)} are not calibrated.")
+        notes.append(f"Polarizations {polarization_names(numbers[~wanted])} are not calibrated.")
 
 
 def _name_feeds(data: UVData, notes: list[str]) -> None:

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.errors import InputError
 from calstudy.base.units import parse_quantity
+from calstudy.base.visibilities import polarization_names
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -24,6 +25,8 @@ KEYS = {
     "polarizations": "polarizations=xx,yy",
 }
 """Keys of selections, with an example each."""
+NOUNS = {"lengths": ("baselines", 1, " m"), "times": ("integrations", 1, ""), "frequencies": ("channels", 1e6, " MHz")}
+"""What a range selects, and the unit of its ends in messages."""
 SAME_FREQUENCY = 1.0
 """Frequencies that differ by at most this, Hz, are the same but for rounding."""
 
@@ -77,16 +80,21 @@ def _value(key: str, value: str, where: str) -> Any:
     if len(ends) != 2:
         raise InputError(f"{where}: write a range such as {KEYS[key]}; either end may be left out")
     try:
-        return tuple(_end(key, end.strip()) for end in ends)
+        low, high = (_end(key, end.strip()) for end in ends)
     except (PydanticCustomError, ValueError) as error:
-        reason = error.message() if isinstance(error, PydanticCustomError) else "not a whole number"
-        raise InputError(f"{where}: {reason}") from None
+        counted = f"not a whole number of at least 0; integrations are counted from 0, such as {KEYS[key]}"
+        raise InputError(f"{where}: {error.message() if isinstance(error, PydanticCustomError) else counted}") from None
+    if low is not None and high is not None and low > high:
+        raise InputError(f"{where}: the first end of the range is above the second; exchange them")
+    return low, high
 
 
 def _end(key: str, text: str) -> float | int | None:
     if not text:
         return None
     if key == "times":
+        if not text.isdecimal():
+            raise ValueError(text)
         return int(text)
     return parse_quantity(text, "m", "14 m") if key == "lengths" else parse_quantity(text, "Hz", "120 MHz")
 
@@ -101,10 +109,10 @@ def select(data: UVData, selection: Selection) -> UVData:
         chosen["antenna_nums"] = [_antenna(data, antenna) for antenna in selection.antennas]
     if selection.times is not None:
         times = np.unique(data.time_array)
-        chosen["times"] = times[_within(np.arange(times.size), selection.times, 0, "times", "integrations")]
+        chosen["times"] = times[_within(np.arange(times.size), selection.times, 0, "times")]
     if selection.frequencies is not None:
         chosen["freq_chans"] = np.flatnonzero(
-            _within(np.ravel(data.freq_array), selection.frequencies, SAME_FREQUENCY, "frequencies", "channels")
+            _within(np.ravel(data.freq_array), selection.frequencies, SAME_FREQUENCY, "frequencies")
         )
     if selection.polarizations is not None:
         chosen["polarizations"] = [_polarization(data, name) for name in selection.polarizations]
@@ -125,10 +133,12 @@ def between(values: np.ndarray, ends: tuple[Any, Any], tolerance: float) -> np.n
     return above & (values <= (np.inf if high is None else high + tolerance))
 
 
-def _within(values: np.ndarray, ends: tuple[Any, Any], tolerance: float, key: str, what: str) -> np.ndarray:
+def _within(values: np.ndarray, ends: tuple[Any, Any], tolerance: float, key: str) -> np.ndarray:
     inside = between(values, ends, tolerance)
     if not inside.any():
-        raise InputError(f"--select {key}: no {what} in this range; the data have {values.min():g} to {values.max():g}")
+        what, unit, name = NOUNS[key]
+        first, last = (f"{end / unit:.7g}{name}" for end in (values.min(), values.max()))
+        raise InputError(f"--select {key}: no {what} in this range; the data have {first} to {last}")
     return inside
 
 
@@ -140,7 +150,7 @@ def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: boo
     positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     pairs = zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True)
     lengths = np.array([np.linalg.norm(positions[b] - positions[a]) for a, b in pairs])
-    chosen = _within(lengths, ends, SAME_LENGTH, "lengths", "baselines (m)")
+    chosen = _within(lengths, ends, SAME_LENGTH, "lengths")
     if autos:
         left = np.union1d(data.ant_1_array[chosen], data.ant_2_array[chosen])
         chosen |= (data.ant_1_array == data.ant_2_array) & np.isin(data.ant_1_array, left)
@@ -164,18 +174,13 @@ def _antenna(data: UVData, name: str) -> int:
 
 
 def _polarization(data: UVData, name: str) -> int:
-    from pyuvdata.utils import polnum2str
-
-    numbers = {}
-    for number in data.polarization_array:
-        numbers[polnum2str(int(number)).lower()] = int(number)
+    numbers = {polarization_names([number]): int(number) for number in data.polarization_array}
     for shown, number in zip(data.get_pols(), list(data.polarization_array), strict=True):
         numbers[shown.lower()] = int(number)
     if data.telescope.feed_array is None:
         # Old files lack the orientation of their feeds; x is taken to be east, as in calibration.
         numbers |= {east: numbers[x] for east, x in (("ee", "xx"), ("nn", "yy")) if x in numbers}
     if name.lower() not in numbers:
-        raise InputError(
-            f"--select polarizations: {name!r} is not in the data, which have {', '.join(data.get_pols())}"
-        )
+        present = polarization_names(data.polarization_array)
+        raise InputError(f"--select polarizations: {name!r} is not in the data, which have {present}")
     return numbers[name.lower()]

@@ -108,7 +108,7 @@ class Select(Section):
     lengths: str | None = Field(None, description="Baseline lengths: '14 m..60 m'.")
     times: str | None = Field(None, description="Integrations, counted from 0: '0..9'.")
     frequencies: str | None = Field(None, description="Channel centres: '120 MHz..180 MHz'.")
-    polarizations: str | None = Field(None, description="Such as 'xx' or 'ee,nn'.")
+    polarizations: str | None = Field(None, description="Such as 'xx,yy'; or 'ee,nn', by the directions of the feeds.")
 
     @field_validator("*")
     @classmethod

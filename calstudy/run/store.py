@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -48,10 +48,11 @@ KEY = re.compile(r"[0-9a-f]{32}")
 
 @dataclass(frozen=True)
 class Product:
-    """A complete product: its folder and its record."""
+    """A complete product: its folder and its record, and whether it was made now, not found."""
 
     path: Path
     record: Mapping[str, Any]
+    made: bool = field(default=False, compare=False)
 
     @property
     def size(self) -> int:
@@ -253,7 +254,7 @@ class Store:
         final = self.folder(record["stage"], record["key"])
         self.discard(record["stage"], record["key"])
         folder.rename(final)
-        return Product(final, complete)
+        return Product(final, complete, made=True)
 
 
 def products(store: Store) -> Iterator[Product]:

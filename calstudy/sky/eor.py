@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from io import StringIO
 from pathlib import Path
 
 import healpy
@@ -182,17 +181,27 @@ def read_power_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises InputError if it cannot be read, or numbers are not positive, or k does not increase.
     """
+    where = f"sky.eor.path = {str(path)!r}"
     try:
-        text = path.read_text(encoding="utf-8").replace(",", " ")
-        found = np.loadtxt(StringIO(text), ndmin=2)
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
-        raise InputError(f"sky.eor.path = {str(path)!r}: cannot be read as a table of numbers ({error})") from None
-    if found.shape[0] < 2 or found.shape[1] != 2:
-        rows, columns = found.shape
-        raise InputError(f"sky.eor.path = {str(path)!r}: needs two columns and two rows, has {columns} and {rows}")
-    if not (np.isfinite(found).all() and (found > 0).all() and (np.diff(found[:, 0]) > 0).all()):
-        raise InputError(f"sky.eor.path = {str(path)!r}: k and P(k) must be positive, and k must increase")
-    return found[:, 0], found[:, 1]
+        raise InputError(f"{where}: cannot be read as a table of numbers ({error})") from None
+    found = [(0.0, 0.0)]
+    for number, line in enumerate(lines, 1):
+        cells = line.partition("#")[0].replace(",", " ").split()
+        if not cells:
+            continue
+        try:
+            k, power = map(float, cells)
+        except ValueError:
+            raise InputError(f"{where}, line {number}: {line!r} is not two numbers, k and P(k)") from None
+        if not (found[-1][0] < k < np.inf and 0 < power < np.inf):
+            raise InputError(f"{where}, line {number}: {line!r}; k and P(k) must be positive, and k must increase")
+        found.append((k, power))
+    if len(found) < 3:
+        raise InputError(f"{where}: needs two rows of k and P(k), has {len(found) - 1}")
+    table = np.array(found[1:])
+    return table[:, 0], table[:, 1]
 
 
 def comoving_geometry(

@@ -27,7 +27,8 @@ from calstudy.base.visibilities import antenna_pairs, flag_cube
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
-from calstudy.calibrate.settings import GainFit
+from calstudy.calibrate.problem import fitted_baselines
+from calstudy.calibrate.settings import GainFit, WeightedFit
 from calstudy.experiment.files import StudyFile, apply_scale, checked
 from calstudy.experiment.model import FIGURES, Figures, Folders, StudyName
 from calstudy.figures import figure_task
@@ -238,12 +239,21 @@ class DataCalibration(DataStudy):
 
         Raises InputError if a file cannot be used.
         """
-        from calstudy.calibrate.weights import conspicuous
+        from calstudy.calibrate.preparation import starting_gains
+        from calstudy.calibrate.weights import conspicuous, make_weights
 
         data, _, notes = observed(self.graph, WHOLE).read()
-        if self.start is not None:
-            read_gains(self.start, "calibration.initial_gains.path", data)
-        return [*notes, *conspicuous(Observation(data))]
+        observation, calibrator = Observation(data), self.file.calibration
+        doubts = conspicuous(observation)
+        if isinstance(calibrator, WeightedFit):
+            fitted = fitted_baselines(observation, getattr(calibrator, "autos", False))
+            if not make_weights(observation, fitted, calibrator.weights).any():
+                kind = calibrator.weights.kind
+                doubts.append(f"Every sample is flagged or has no weight by weights: {kind}; no solve will give gains.")
+            if self.start is not None:
+                gains = read_gains(self.start, "calibration.initial_gains.path", data)
+                starting_gains(observation.baselines(fitted), gains)
+        return [*notes, *doubts]
 
     @property
     def start(self) -> Path | None:

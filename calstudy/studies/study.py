@@ -353,7 +353,9 @@ def _make_missing(
             console.print(text, markup=False)
 
         products = execute(plan.todo, store, workers, done, told, plan.again)
-    return RunProducts({**found_of(unique(targets), store), **products}, plan.todo)
+    # Of two runs at once, one finds what the other has made.
+    made = tuple(task for task in plan.todo if products[task.key].made)
+    return RunProducts({**found_of(unique(targets), store), **products}, made)
 
 
 def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) -> list[str]:

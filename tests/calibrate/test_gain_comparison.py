@@ -165,6 +165,10 @@ def test_files_that_have_nothing_in_common_are_refused(template, gains):
     left, right = (cal.select(antenna_nums=cal.ant_array[part], inplace=False) for part in (slice(4), slice(4, None)))
     with pytest.raises(InputError, match="no antenna in common"):
         pair_gains(left, right)
+    other = cal.copy()
+    other.jones_array = np.array([-6])
+    with pytest.raises(InputError, match=r"0 feed.* in common.*: the first has gains of xx, the second of yy"):
+        pair_gains(cal, other)
 
 
 @pytest.mark.filterwarnings("ignore")

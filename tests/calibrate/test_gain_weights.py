@@ -19,7 +19,7 @@ from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.calibrate import calamity
 from calstudy.calibrate.basis import dpss_vectors
 from calstudy.calibrate.calamity import make_solver
-from calstudy.calibrate.calibrators.least_squares import Calamity, SkyBased
+from calstudy.calibrate.calibrators.least_squares import Calamity, EmpiricalBayes, SkyBased
 from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.calibrators.redcal import Redcal
 from calstudy.calibrate.degeneracy import fix_phase
@@ -155,6 +155,25 @@ def test_weights_that_run_away_leave_the_result_of_equal_weights():
     assert record.status == "max-steps"
     assert "the result is that of equal weights" in record.message
     assert np.array_equal(weighted.gains.gain_array, equal.gains.gain_array)
+
+
+def test_weights_that_run_away_leave_the_deviation_that_equal_weights_estimate():
+    """Not the one that the first pass starts from."""
+    noise, toy = 0.6, make_toy(scattered(8), noise=0.6)
+    uvd = make_uvdata(toy, n_times=1)
+    sky = sky_of(uvd, toy.foregrounds * np.where(np.arange(len(toy.foregrounds)) % 2, 1.5, 0.5)[:, None])
+    level = noise * np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2))
+    prior = {"mean": "sky-model", "deviation": "estimated", "noise": f"{level} Jy"}
+    weighted, equal = (
+        run_calibrator(EmpiricalBayes(weights=weights, foreground_prior=prior), uvd, sky)
+        for weights in (GainWeights(), FLAT)
+    )
+    ((record,), (flat,)) = weighted.solutions, equal.solutions
+    assert record.status == "max-steps"
+    assert "the result is that of equal weights" in record.message
+    assert record.diagnostics["deviation"] == pytest.approx(flat.diagnostics["deviation"], rel=1e-3)
+    assert record.diagnostics["deviation_error"][0] == pytest.approx(flat.diagnostics["deviation_error"][0], rel=0.1)
+    assert np.allclose(weighted.gains.gain_array, equal.gains.gain_array, rtol=1e-3)
 
 
 def test_weights_that_run_away_leave_nothing_to_the_next_integration():

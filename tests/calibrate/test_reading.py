@@ -93,7 +93,7 @@ def test_cross_hands_are_left_out_and_told(toy):
     crossed.check()
     prepared, notes = prepare(both + crossed)
     assert list(prepared.polarization_array) == [-5, -6]
-    assert notes == ["Polarizations en, ne are not calibrated."]
+    assert notes == ["Polarizations xy, yx are not calibrated."]
     with pytest.raises(InputError, match="no parallel hands"):
         prepare(crossed)
 
@@ -170,9 +170,12 @@ def test_channels_at_the_ends_are_selected(data):
         ("times=a..b", "not a whole number"),
         ("frequencies=100..200", "has no unit"),
         ("antennas=999", "'999' is not in the data"),
-        ("polarizations=xy", "not in the data, which have ee"),
-        ("times=50..", "no integrations in this range"),
-        ("lengths=900 m..", "no baselines"),
+        ("polarizations=xy", "not in the data, which have xx"),
+        ("times=50..", "no integrations in this range; the data have 0 to 2"),
+        ("times=-1..", "not a whole number of at least 0"),
+        ("times=2..1", "exchange them"),
+        ("frequencies=1 MHz..2 MHz", r"no channels in this range; the data have 160 MHz to 185\.2 MHz"),
+        ("lengths=900 m..", r"no baselines in this range; the data have [\d.]+ m to [\d.]+ m"),
     ],
 )
 def test_bad_selections_are_one_sentence(data, text, match):

@@ -144,7 +144,7 @@ def test_blocks_without_one_of_the_polarizations_are_left_out(observe, white, be
     even.flag_array[n : 2 * n, :, 1] = True
     assert estimate_spectra(even, odd, beam, SETTINGS).n_times == 2
     odd.flag_array[2 * n :, :, 0] = even.flag_array[:n, :, 0] = True
-    with pytest.raises(InputError, match=r"power\.coherent_time: every block lacks one of the polarizations ee, nn"):
+    with pytest.raises(InputError, match=r"power\.coherent_time: every block lacks one of the polarizations xx, yy"):
         estimate_spectra(even, odd, beam, SETTINGS)
 
 

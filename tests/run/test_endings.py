@@ -17,6 +17,7 @@ import yaml
 from command_line import run_command
 from filelock import FileLock
 from number_task import Number, run
+from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import InputError
@@ -24,6 +25,7 @@ from calstudy.run import store as store_module
 from calstudy.run.execution import Workers, WorkOrder, execute, perform, schedule
 from calstudy.run.store import Store, leftovers, products
 from calstudy.run.task import Task
+from calstudy.studies import study
 from calstudy.studies.folder import LOG, log_to, open_folder
 
 KEY = "0" * 32
@@ -64,6 +66,21 @@ def test_a_wait_of_a_worker_is_told_to_the_run(store, monkeypatch):
 
     execute(schedule([task], store).todo, store, Workers(1, store.root / "log"), told=tell)
     assert told[0].startswith(f"number {task.key}: waits for the lock")
+
+
+def test_what_another_run_made_meanwhile_is_not_counted_as_made(store, monkeypatch):
+    first, second = Number("first", number=1), Number("second", number=2)
+    plan = study.schedule
+
+    def planned(targets, *arguments, **named):
+        found = plan(targets, *arguments, **named)
+        run(first, store)
+        return found
+
+    monkeypatch.setattr(study, "schedule", planned)
+    made = study.make([first, second], store, Workers(1, store.root / "log"), Console(quiet=True))
+    assert made.tasks == (second,)
+    assert made.products.keys() == {first.key, second.key}
 
 
 def test_a_file_system_without_locks_is_refused(store, monkeypatch):

@@ -196,10 +196,10 @@ def test_the_input_power_of_a_table_is_the_table_in_its_own_units(table):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("0.1 1 2\n0.2 1 2\n", "needs two columns and two rows, has 3 and 2"),
-        ("0.1, 1\n", "has 2 and 1"),
-        ("k, P\n0.1, 1\n", "cannot be read as a table of numbers"),
-        ("0.1 1\n0.1 2\n", "k must increase"),
+        ("0.1 1 2\n0.2 1 2\n", "line 1: .* is not two numbers"),
+        ("0.1, 1\n", "needs two rows of .* has 1"),
+        ("k, P\n0.1, 1\n", "line 1: 'k, P' is not two numbers"),
+        ("# k P\n\n0.1 1\n0.1 2\n", "line 4: .* k must increase"),
         ("0.1 1\n0.2 -2\n", "must be positive"),
         ("0.1 1\n0.2 nan\n", "must be positive"),
     ],

@@ -163,8 +163,9 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
     # Fits whose preconditioner is singular in single precision converge since 3.
     # Directions that only the prior determines are fitted in double precision since 4.
     # So are fits that need many steps since 5.
-    # Where weights run away, the result is that of equal weights since 6, in every integration.
-    version: ClassVar[int] = 6
+    # Where weights run away, the result is that of equal weights since 6, in every integration, and of the deviation
+    # that is estimated with these since 7.
+    version: ClassVar[int] = 7
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"

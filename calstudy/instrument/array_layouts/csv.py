@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -63,7 +62,7 @@ def read_positions(path: Path, numbered: bool = False) -> Layout:
     """Return the antennas of a table; with `numbered`, raise InputError if it does not number them."""
     if not path.is_file():
         raise InputError(f"instrument.layout.path: there is no file {path}")
-    rows = _read_rows(path)
+    lines, rows = _read_rows(path)
     columns = set(rows[0]) if rows else set()
     geodetic = {"latitude", "longitude"} <= columns and not set(LOCAL) <= columns
     missing = set(GEODETIC if geodetic else LOCAL) - columns
@@ -74,46 +73,53 @@ def read_positions(path: Path, numbered: bool = False) -> Layout:
         )
     if numbered and "number" not in columns:
         raise InputError(f"instrument.layout.path: {path} needs a column number, by which antennas are found")
-    try:
-        positions = np.array([[float(row[name]) for name in (GEODETIC if geodetic else LOCAL)] for row in rows])
-        numbers = np.array([int(row["number"]) for row in rows]) if "number" in columns else np.arange(len(rows))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"instrument.layout.path: {path} holds an entry that is not a number ({error})") from None
+    positions, found = np.zeros((len(rows), 3)), []
+    for index, (line, row) in enumerate(zip(lines, rows, strict=True)):
+        try:
+            positions[index] = [float(row[name]) for name in (GEODETIC if geodetic else LOCAL)]
+            found.append(int(row.get("number", str(index))))
+        except ValueError as error:
+            raise InputError(
+                f"instrument.layout.path: line {line} of {path} holds an entry that is not a number ({error})"
+            ) from None
+        if not np.isfinite(positions[index]).all():
+            raise InputError(f"instrument.layout.path: line {line} of {path} has a position that is not finite")
+    numbers = np.array(found)
     if numbers.max() > LARGEST_NUMBER:
         raise InputError(f"instrument.layout.path: antenna number {numbers.max()} in {path} exceeds {LARGEST_NUMBER}")
     place = SITES["mwa"]
     if geodetic:
-        positions, place = _about_their_mean(positions, path)
+        positions, place = _about_their_mean(positions, lines, path)
     names = tuple(row["name"] for row in rows) if "name" in columns else tuple(f"ant{n:03d}" for n in numbers)
     return Layout(path.stem, numbers, names, positions, place, surveyed=geodetic)
 
 
-def _read_rows(path: Path) -> Sequence[Mapping[str, str]]:
-    """Return the rows of a table by the names in `COLUMNS`; raises InputError if it is none."""
+def _read_rows(path: Path) -> tuple[list[int], list[dict[str, str]]]:
+    """Return the lines of a table's rows, and the rows by the names in `COLUMNS`; raises InputError if it is none."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        text = path.read_text(encoding="utf-8-sig").splitlines()
+        places = [at for at, line in enumerate(text) if line.strip() and not line.lstrip().startswith("#")]
+        lines = [text[at] for at in places]
         if lines and not re.search("[,;\t]", lines[0].strip()):
             lines = [re.sub(r"\s+", "\t", line.strip()) for line in lines]
         separator = next((mark for mark in (",", ";", "\t") if lines and mark in lines[0]), ",")
-        cells = list(csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True))
+        reader = csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True)
+        cells = [([cell.strip() for cell in row], places[reader.line_num - 1] + 1) for row in reader]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"instrument.layout.path: {path} is not a CSV file in UTF-8 ({error})") from None
-    header, *rows = [[cell.strip() for cell in row] for row in cells] or [[]]
-    uneven = next((row for row in rows if len(row) != len(header)), None)
+    (header, _), *rows = cells or [([], 0)]
+    uneven = next((line for row, line in rows if len(row) != len(header)), None)
     if uneven is not None:
-        raise InputError(
-            f"instrument.layout.path: row {separator.join(uneven)!r} of {path} has more or fewer cells than the first"
-        )
+        raise InputError(f"instrument.layout.path: line {uneven} of {path} has more or fewer cells than the first")
     known = {other: name for name, others in COLUMNS.items() for other in (name, *others)}
     names = [known.get(cell.lower(), cell) for cell in header]
     twice = next((name for name in COLUMNS if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"instrument.layout.path: {path} has the column {twice} twice")
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    return [line for _, line in rows], [dict(zip(names, row, strict=True)) for row, _ in rows]
 
 
-def _about_their_mean(geodetic: np.ndarray, path: Path) -> tuple[np.ndarray, Place]:
+def _about_their_mean(geodetic: np.ndarray, lines: list[int], path: Path) -> tuple[np.ndarray, Place]:
     """Return east, north, up of latitudes and longitudes in degrees and heights in m, (Nants, 3), and their mean."""
     from astropy.coordinates import EarthLocation
 
@@ -121,9 +127,10 @@ def _about_their_mean(geodetic: np.ndarray, path: Path) -> tuple[np.ndarray, Pla
     # Neighbours on either side of 180 degrees differ by little.
     longitudes = longitudes[0] + (longitudes - longitudes[0] + 180) % 360 - 180
     if not (np.abs(latitudes) <= 90).all() or np.ptp(longitudes) > 1 or np.ptp(latitudes) > 1:
+        away = np.abs([latitudes - np.median(latitudes), longitudes - np.median(longitudes)]).max(axis=0)
         raise InputError(
             f"instrument.layout.path: latitudes in {path} must be from -90 to 90 degrees, and latitudes and longitudes "
-            "within one degree of each other"
+            f"within one degree of each other; line {lines[away.argmax()]} is the farthest"
         )
     place = Place(latitudes.mean(), longitudes.mean(), heights.mean())
     found = EarthLocation.from_geodetic(longitudes, latitudes, heights)
