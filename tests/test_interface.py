@@ -182,6 +182,9 @@ def test_what_a_run_lacks_has_a_reason(run, tmp_path):
             read("residual", half="first")
     assert run.claims.empty
     assert run.parts == {}
+    for worlds in (None, ["ideal"]):
+        with pytest.raises(InputError, match="no comparison, and has no standings; `scores` has"):
+            run.standings(worlds=worlds)
     with pytest.raises(InputError, match="no table 'comparison'"):
         run.table("comparison")
     with pytest.raises(InputError, match="not the folder of a finished run"):

@@ -82,6 +82,11 @@ def test_the_experiment_of_which_can_be_copied_and_changed(here, capsys):
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
         (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
         (["init", "mine", "--example", "calibrators"], "--example calibrators: is made of other files"),
+        (["init", "mine", "--beam", "hera"], "--beam hera: is the beam of measured data"),
+        (
+            ["init", "mine", "--data", "hera_qm:data/x", "--beam", "her"],
+            "--beam: 'her' is not a beam, did you mean 'hera'",
+        ),
         (["fields", "--schema", "nowhere/schema.json"], "--schema nowhere/schema.json: cannot be written"),
         (["fields", "--schema", "taken.yaml"], "--schema taken.yaml: is another file, and is not overwritten"),
         (["fields", "calibration", "--schema", "s.json"], "the schema is of whole files; leave out the section"),

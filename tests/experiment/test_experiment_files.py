@@ -133,7 +133,11 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ),
         (
             "{name: a, calibration: {calibrator: sky-based, basis: {buffer: 10 ns}}}",
-            "calibration.basis: unknown key, did you mean 'baselines'? (allowed: assumed, autos, baselines,",
+            "calibration.basis: 'sky-based' has no such key, but calamity, calamity-redundant, delay-weighted, ",
+        ),
+        (
+            "{name: a, instrument: {layout: {kind: hex, side: 3, spacing: 14 m, count: 16}}}",
+            "instrument.layout.count: 'hex' has no such key, but golomb,",
         ),
     ],
 )

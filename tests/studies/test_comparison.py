@@ -153,6 +153,8 @@ def test_the_answer_is_on_the_report_and_in_python(compared, summaries):
     assert found.worlds["sky-based"] == ["flux errors: 20 %"]
     lowest = min(summaries[world]["CALAMITY"]["bands"][1]["transfer"] for world in WORLDS)
     assert found.transfer["CALAMITY"] == lowest
+    with pytest.raises(InputError, match="limit = 0: must be greater than 0"):
+        calstudy.open_run(compared.folder).standings(limit=0)
     assert calstudy.open_run(compared.folder).standings(limit=1e9).loc[(0.2, 0.5)].standing["sky-based"] == "passes"
     page = (compared.folder / "report.html").read_text()
     assert page.index("Which calibrator to trust") < page.index("Scores: ideal")
