@@ -80,6 +80,8 @@ def test_the_experiment_of_which_can_be_copied_and_changed(here, capsys):
         (["init", "my study"], "'my study' cannot name an experiment"),
         (["init", "../mine"], "cannot name an experiment"),
         (["init", "mine", "--example", "lowsrn"], "neither a file nor a published experiment"),
+        (["plan", "quickstrt"], "nor a published experiment, did you mean 'quickstart'?"),
+        (["plan", "quickstart", "--set", "instrument..beam=airy"], "--set instrument..beam=airy: write a dotted path"),
         (["init", "mine", "--example", "paper"], "--example paper: is made of other files"),
         (["init", "mine", "--example", "calibrators"], "--example calibrators: is made of other files"),
         (["init", "mine", "--beam", "hera"], "--beam hera: is the beam of measured data"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from types import NoneType
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -49,6 +50,9 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
     members: list[Any] = [root]
     holder: type[BaseModel] | None = None
     for step in location:
+        if len([member for member in members if member is not NoneType]) > 1:
+            members = []  # The step is pydantic's name of one of several types.
+            continue
         models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
         holder = models[0] if models else None
         path.append(str(step))

@@ -126,6 +126,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
             "outputs.figures: asks for 'gains', which needs variants.residual to have foregrounds, effects: true and",
         ),
         ("{}", "name: missing, and it has no default"),
+        ("{name: a, corruption: {noise: {factor: 1.0e+300}}}", "corruption.noise.factor = 1e+300: must be at most"),
         ("{name: a b}", "name: 'a b' cannot name a folder"),
         (
             "{name: a, calibration: {solver: {max_steps: 0}, basis: {bufer: 3}}}",

@@ -175,9 +175,14 @@ def test_faults_name_the_case_and_the_field(tmp_path):
         load_study(comparison_file(tmp_path, figures=["wedge"]))
     with pytest.raises(ExperimentError, match="wrlds: unknown key, did you mean 'worlds'"):
         load_study(comparison_file(tmp_path, wrlds={}))
+    with pytest.raises(ExperimentError, match="experiment = 3: must be a block of keys"):
+        load_study(comparison_file(tmp_path, experiment=3))
+    with pytest.raises(ExperimentError, match="scales = 3: must be a block of keys"):
+        load_study(comparison_file(tmp_path, scales=3))
     # Every case is held to the same yardstick, with the calibrator of its label, and no block is lost.
     for changes, sentence in {
         "calibration.calibrator: none": "'a' changes the calibrator",
+        "name: mine": "'a' changes name, which has no effect",
         "power.taper: none": "'a' changes power.taper; all cases are measured alike",
         "instrument: {as_built: {}}": r"'a' replaces all of instrument; .* \(instrument.as_built\)",
     }.items():
