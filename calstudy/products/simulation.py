@@ -191,12 +191,12 @@ class Simulate(_Simulated, stage="simulate", version=3):
         component = self.component
         cubes = (to_cube(read_visibilities(folder / CHUNK)) for folder in self.chunk[: len(component.chunks)])
         data = from_cube(component.template, assemble(component.chunks, cubes))
+        if not np.any(data.data_array):
+            raise InputError(
+                f"{self.label}: no source is above the horizon; use more, or another instrument.times.start_lst"
+            )
         quality: dict[str, Any] = {"interpolation": component.interpolation_error(to_cube(data))}
         if not component.is_eor:
-            if not np.any(data.data_array):
-                raise InputError(
-                    f"{self.label}: no source is above the horizon; use more, or another instrument.times.start_lst"
-                )
             quality["delay_floor"] = _floors(data)
         write_visibilities(data, output / VISIBILITIES)
         write_json(output / QUALITY, quality)
