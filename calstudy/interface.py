@@ -32,6 +32,7 @@ from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
+    COMPARISON,
     DATA,
     GAINS,
     MODEL,
@@ -321,7 +322,8 @@ class ByVariant(Mapping[str, Any]):
 class OpenRun:
     """The results of a finished run.
 
-    Every property raises InputError, with the reason, if the run does not have what it returns.
+    Lists of what a run has (`claims`, `figures`, `parts`, `products`, `tables`) are empty if it has none. All else
+    raises InputError, with the reason, if the run does not have what it returns.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -375,10 +377,13 @@ class OpenRun:
         """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
 
         Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
-        limit in these worlds in units of the EoR, and `transfer`, the smallest T. A table without rows for other runs.
+        limit in these worlds in units of the EoR, and `transfer`, the smallest T.
         """
         import pandas
 
+        self._tables.path(COMPARISON, "the run is no comparison, and has no standings; `scores` has its T and bias")
+        if not limit > 0:
+            raise InputError(f"limit = {limit!r}: must be greater than 0, in units of the power of the EoR")
         found = self._folder.standings(limit, worlds)
         rows = [
             (
@@ -415,7 +420,7 @@ class OpenRun:
     @property
     def tables(self) -> list[str]:
         """Names of the tables that `table` reads."""
-        return sorted(path.stem for path in self._tables.folders[0].glob("*.csv"))
+        return sorted(path.stem for path in (self.folder / "tables").glob("*.csv"))
 
     def table(self, name: str) -> pandas.DataFrame:
         """Return a table of the run, such as "comparison" or "eor.outside-wedge"."""

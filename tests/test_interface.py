@@ -1,6 +1,7 @@
 """The Python interface returns what the files of a run hold, with labels and units."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.report.headline import read_signal
+from calstudy.report.page import write_report
 from calstudy.results.reader import RunFolder
 
 
@@ -182,11 +184,34 @@ def test_what_a_run_lacks_has_a_reason(run, tmp_path):
             read("residual", half="first")
     assert run.claims.empty
     assert run.parts == {}
+    for worlds in (None, ["ideal"]):
+        with pytest.raises(InputError, match="no comparison, and has no standings; `scores` has"):
+            run.standings(worlds=worlds)
     with pytest.raises(InputError, match="no table 'comparison'"):
         run.table("comparison")
     with pytest.raises(InputError, match="not the folder of a finished run"):
         calstudy.open_run(tmp_path)
     assert "T " in repr(run)
+
+
+def test_a_sky_below_the_horizon_ends_in_a_sentence(file):
+    study = calstudy.load(file, **{"sky.foregrounds.count": 1, "instrument.times.start_lst": "1.8 h"})
+    with pytest.raises(InputError, match="foregrounds: no source is above the horizon; use more, or another"):
+        study.run(workers=1, quiet=True)
+
+
+def test_damaged_tables_are_named_with_the_remedy(run, tmp_path):
+    shutil.copytree(run.folder, tmp_path / "run")
+    for path in (tmp_path / "run" / "tables").iterdir():
+        path.write_text("junk")
+    damaged = calstudy.open_run(tmp_path / "run")
+    for read in (lambda: damaged.scores, lambda: damaged.transfer, lambda: damaged.spectra["eor"]):
+        with pytest.raises(InputError, match="is damaged; run the experiment again"):
+            read()
+    with pytest.raises(InputError, match=r"tables\.json: is damaged"):
+        write_report(damaged.folder)
+    shutil.rmtree(damaged.folder / "tables")
+    assert damaged.tables == []
 
 
 def test_a_run_of_an_older_version_says_so(run, tmp_path):

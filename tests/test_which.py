@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from command_line import run_and_read, run_command
 
-from calstudy.base.errors import InputError
 from calstudy.cli.which import array_changes
 from calstudy.studies.load import load_study
 
@@ -55,15 +54,34 @@ def test_files_are_found_from_the_working_directory(positions, tmp_path):
     assert json.loads(beam.partition("=")[2]) == {"kind": "beamfits", "path": str(tmp_path / "dish.beamfits")}
 
 
-def test_the_beam_of_an_unknown_array_must_be_given(positions):
-    with pytest.raises(InputError, match=r"^--beam: is needed"):
-        array_changes(positions, "ovro-lwa", None)
+def test_the_beam_of_an_unknown_array_must_be_given(positions, capsys):
+    status, written = run_command(capsys, "which", positions, "--site", "ovro-lwa", "--dry-run")
+    assert status == 2
+    assert written.startswith("calstudy: --beam: is needed, because none is known for this array and site: the name")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("missing.csv", "--site", "mars"), ["LAYOUT = ", "--site: 'mars' is not a", "--beam: is needed"]),
+        (("mine.csv",), ["--site: is required", "--beam: is needed"]),
+        (("{kind: hex, side: 0}", "--beam", "dish"), ["LAYOUT.side = 0: must", "--beam: 'dish' is not a beam"]),
+        (("mine.csv", "--set", "foo.bar=3", "--site", "hera"), ["foo: unknown key"]),
+        (("missing.csv", "--set", "foo.bar=3"), ["LAYOUT = ", "--beam: is needed", "foo: unknown key"]),
+    ],
+)
+def test_all_faults_of_the_options_are_said_at_once(positions, capsys, arguments, named):
+    status, written = run_command(capsys, "which", *arguments, "--dry-run")
+    assert status == 2
+    assert len(written.splitlines()) == len(named)
+    for line, start in zip(written.splitlines(), named, strict=True):
+        assert line.startswith(f"calstudy: {start}")
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("nonsense",), "'nonsense' is not a layout"),
+        (("nonsense",), "LAYOUT: 'nonsense' is not a layout"),
         (("missing.csv", "--site", "hera"), "LAYOUT = "),
         (("mine.csv", "--beam", "airy"), "--site: is required"),
         (("hera-19", "--beam", "dish"), "--beam: 'dish' is not a beam"),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, nearest
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "published"
 
@@ -50,10 +50,10 @@ def find_experiment(path: Path) -> Path:
     """
     if path.exists() or path.name != str(path) or path.suffix:
         return path
-    if path.name in experiment_names():
+    if path.name in (names := experiment_names()):
         return published("experiments") / f"{path.name}.yaml"
-    listed = ", ".join(experiment_names())
-    raise InputError(f"{path}: neither a file nor a published experiment (there are: {listed})")
+    hint = nearest(path.name, names)
+    raise InputError(f"{path}: neither a file nor a published experiment{hint} (there are: {', '.join(names)})")
 
 
 def reference_folder() -> Path:

@@ -167,6 +167,10 @@ class Kinds(Generic[S]):
             raise InputError(f"needs {self.tag!r}, {self.wanted}")
         return self.find(reference), reference
 
+    def having(self, key: str) -> list[str]:
+        """Return the built-in kinds of block with a key."""
+        return [name for name in self.built_in() if key in self.find(name).model_fields]
+
     def make(self, block: Any, default: str | None = None, **context: Any) -> S:
         """Return the section that a block of settings describes.
 
@@ -216,7 +220,7 @@ class KindField:
         except ValidationError as error:
             content = dict(value) if isinstance(value, Mapping) else {kinds.tag: value}
             model, _ = kinds.class_of(content, self.default, context.get("folder"))
-            nested = {"error": error, "content": content, "model": model}
+            nested = {"error": error, "content": content, "model": model, "kinds": kinds}
             raise PydanticCustomError(NESTED, "nested", nested) from None
         except InputError as error:
             raise fault(kinds.tag if isinstance(value, Mapping) else "", str(error)) from None

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+from calstudy.cli.options import named_as_options
 
 MODELINE = "# yaml-language-server: $schema="
 """Start of the line from which editors know the schema of a file."""
@@ -32,11 +33,13 @@ Data = Annotated[
 List = Annotated[
     bool, typer.Option("--list", help="List the published experiments, which other commands take by name.")
 ]
-Beam = Annotated[str, typer.Option(help="The beam of measured data: hera, airy, gaussian, ..., or a file.py.")]
+Beam = Annotated[
+    str | None, typer.Option(help="The beam of measured data: hera (the default), airy, gaussian, ..., or a file.py.")
+]
 
 
 def init(
-    name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = "hera", listed: List = False
+    name: Name = "my-study", example: Example = None, data: Data = None, beam: Beam = None, listed: List = False
 ) -> None:
     """Write a commented experiment file, NAME.yaml, into this folder; nothing is overwritten.
 
@@ -53,16 +56,29 @@ def init(
     path = Path(f"{name}.yaml")
     if example is not None and data is not None:
         raise InputError("--example and --data: choose one")
+    _require_usable(beam, data)
     if not STUDY_NAME.fullmatch(name):
         raise InputError(f"{name!r} cannot name an experiment: use at most 64 letters, digits, '_', '.', '-'")
     if data is not None:
-        text = _filled("observed", name=name, beam=beam, **_described(data))
+        text = _filled("observed", name=name, beam=beam or "hera", **_described(data))
     else:
         text = _filled("starter", name=name) if example is None else _copy(example, name)
     if path.exists():
         raise InputError(f"{path}: exists already, and is not overwritten; choose another name or remove it")
     path.write_text(f"{MODELINE}{published('experiments') / SCHEMA_FILE}\n{text}", encoding="utf-8")
     typer.echo(f"{path}: next, `calstudy plan {path}`")
+
+
+def _require_usable(beam: str | None, data: str | None) -> None:
+    """Raise InputError for a beam of no measured data, and for the name of no beam."""
+    from calstudy.base.plugins import FILE_REFERENCE
+    from calstudy.instrument.settings import BEAMS
+
+    if beam is not None and data is None:
+        raise InputError(f"--beam {beam}: is the beam of measured data, which --data names; else set instrument.beam")
+    if beam is not None and not beam.startswith("{") and not FILE_REFERENCE.fullmatch(beam):
+        with named_as_options("--beam: {}".format):
+            BEAMS.find(beam)
 
 
 def _list_examples() -> None:

@@ -11,14 +11,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calstudy.base.errors import InputError
 from calstudy.cli.options import MaxMemory, Scale, Set, Workers, named_as_options
 
 BEAMS = {"hera": "hera", "mwa": "mwa-embedded-element"}
 """Beams of the antennas of sites."""
 FIELDS = (
-    (r"^instrument\.layout(\.path)?(?= =|:)", "LAYOUT"),
+    (r"^instrument\.layout(\.path)?(?=[ :.])", "LAYOUT"),
     (r"^instrument\.location(\.\w+)?(?= =|:)", "--site"),
+    (r"^instrument\.beam \(empty\): must be", "--beam: is needed, because none is known for this array and site:"),
     (r"^instrument\.beam(\.path)?(?= =|:)", "--beam"),
 )
 """Fields in messages, and the options that set them."""
@@ -83,7 +83,7 @@ def which(
 
 
 def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
-    """Return the changes of the experiment, as of --set; raises InputError if the beam must be given.
+    """Return the changes of the experiment, as of --set; the beam is empty if none is known.
 
     Layout and beam may also be blocks in braces, as in an experiment file.
     """
@@ -94,9 +94,11 @@ def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
         changes["instrument.location"] = _place(site)
     if beam is None:
         # The site of a block, or of a user's file, is not known here.
-        own = LAYOUTS.find(layout).site if re.fullmatch(r"[\w-]+", layout) else None
-        if (beam := BEAMS.get(site or "") or BEAMS.get(own or "")) is None:
-            raise InputError("--beam: is needed, because none is known for this array and site: such as --beam airy")
+        known = layout in LAYOUTS.names()
+        own = LAYOUTS.find(layout).site if known else None
+        # A name of no layout is a fault by itself.
+        other = "null" if known or not re.fullmatch(r"[\w-]+", layout) else "hera"
+        beam = BEAMS.get(site or "") or BEAMS.get(own or "") or other
     changes["instrument.beam"] = _block(beam, "beamfits", (".beamfits", ".fits"))
     return [f"{path}={value}" for path, value in changes.items()]
 

@@ -81,7 +81,7 @@ class NoiseRelativeToEor(Section):
     """Thermal noise with a standard deviation of `factor` times the rms of the EoR visibilities (paper: 10)."""
 
     kind: Literal["times-eor"] = "times-eor"
-    factor: float = Field(10.0, gt=0)
+    factor: float = Field(10.0, gt=0, le=1e9)
     seeds: Seeds = (3, 4)
     seeds_without_eor: Seeds | None = OF_TWINS
 
@@ -90,7 +90,7 @@ class NoiseRelativeToForegrounds(Section):
     """Thermal noise of `factor` times the rms of the foreground visibilities (paper §Low SNR: 0.1)."""
 
     kind: Literal["times-foregrounds"]
-    factor: float = Field(0.1, gt=0)
+    factor: float = Field(0.1, gt=0, le=1e9)
     seeds: Seeds = (3, 4)
     seeds_without_eor: Seeds | None = OF_TWINS
 

@@ -146,7 +146,7 @@ TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
 def parse_override(text: str) -> tuple[str, Any]:
     """Split ``path=value`` of the option --set; the value is read as YAML."""
     path, equals, value = text.partition("=")
-    if not equals or not path.strip():
+    if not equals or not all(map(str.strip, path.split("."))):
         raise InputError(f"--set {text}: write a dotted path and a value, such as --set instrument.times.count=8")
     return path.strip(), parse_yaml(value, f"--set {text}")
 
@@ -186,7 +186,7 @@ def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
         return result
     scales = data.get("scales") or {}
     if not isinstance(scales, dict) or not isinstance(scales.get(scale), dict):
-        names = list(scales) if isinstance(scales, dict) else []
+        names = [name for name in scales if isinstance(scales[name], dict)] if isinstance(scales, dict) else []
         listed = f"the file has: {', '.join(names)}" if names else "the file has no scales"
         raise InputError(f"--scale {scale}: not a scale of this experiment{nearest(scale, names)} ({listed})")
     for path, value in scales[scale].items():

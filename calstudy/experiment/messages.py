@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from types import NoneType
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import nearest
 from calstudy.base.paths import value_at
-from calstudy.base.schema import NESTED, alternatives
+from calstudy.base.schema import NESTED, Kinds, alternatives
 
 KINDS = {
     "int_type": "a whole number",
@@ -49,6 +50,9 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
     members: list[Any] = [root]
     holder: type[BaseModel] | None = None
     for step in location:
+        if len([member for member in members if member is not NoneType]) > 1:
+            members = []  # The step is pydantic's name of one of several types.
+            continue
         models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
         holder = models[0] if models else None
         path.append(str(step))
@@ -84,7 +88,17 @@ def _bound(number: float, unit: str) -> str:
     return f"{number / fitting[0]:.10g} {PREFIXES[fitting[0]]}{unit}"
 
 
-def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
+def _unknown(key: str, holder: type[BaseModel] | None, data: Any, kinds: Kinds[Any] | None) -> str:
+    """Return the sentence on a key that a block has not; `kinds` are those of the block, if it is one of several."""
+    keys = sorted(holder.model_fields) if holder else []
+    if kinds is not None and (others := kinds.having(key)):
+        what = f"{data[kinds.tag]!r} has no such key, but {', '.join(others)} {'has' if len(others) == 1 else 'have'}"
+    else:
+        what = f"unknown key{nearest(key, keys)}"
+    return f"{what} (allowed: {', '.join(keys)})"
+
+
+def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str, kinds: Kinds[Any] | None) -> str:
     kind, context = error["type"], error.get("ctx", {})
     inner, holder = _locate(root, error["loc"])
     path = f"{prefix}{inner}" if inner else prefix.removesuffix(".")
@@ -94,8 +108,7 @@ def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str) -> str:
     if kind == "quantity":
         return f"{path}: {context['value']} {context['reason']}"
     if kind == "extra_forbidden":
-        keys = sorted(holder.model_fields) if holder else []
-        return f"{path}: unknown key{nearest(str(error['loc'][-1]), keys)} (allowed: {', '.join(keys)})"
+        return f"{path}: {_unknown(str(error['loc'][-1]), holder, data, None if '.' in inner else kinds)}"
     if kind == "missing":
         return f"{path}: missing, and it has no default"
     if kind == "value_error":
@@ -130,7 +143,9 @@ def _is_inside(location: tuple[int | str, ...], above: tuple[int | str, ...]) ->
     return len(location) > len(above) and location[: len(above)] == above
 
 
-def _all(error: ValidationError, root: type[BaseModel], data: Any, prefix: str) -> Iterator[str]:
+def _all(
+    error: ValidationError, root: type[BaseModel], data: Any, prefix: str, kinds: Kinds[Any] | None = None
+) -> Iterator[str]:
     found = error.errors()
     for item in found:
         # A list is too short for pydantic if one of its items is wrong, which has a sentence of its own.
@@ -138,9 +153,9 @@ def _all(error: ValidationError, root: type[BaseModel], data: Any, prefix: str) 
             continue
         if item["type"] == NESTED:
             path, context = f"{prefix}{_locate(root, item['loc'])[0]}.", item["ctx"]
-            yield from _all(context["error"], context["model"], context["content"], path)
+            yield from _all(context["error"], context["model"], context["content"], path, context["kinds"])
         else:
-            yield _sentence(root, item, data, prefix)
+            yield _sentence(root, item, data, prefix, kinds)
 
 
 def sentences(error: ValidationError, root: type[BaseModel], data: Any) -> list[str]:

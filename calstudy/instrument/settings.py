@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.observation import Frame
@@ -94,12 +94,18 @@ class Times(Section):
         return self
 
 
+def _own_site(layout: Plugin) -> Any:
+    # `ArrayLayout` has it, which this module cannot import.
+    return getattr(layout, "site", None)
+
+
 class InstrumentSettings(Section):
     """Positions and beams of the antennas, and times and frequencies of the observation."""
 
     layout: Layout = Field(default_factory=lambda: LAYOUTS.make(DEFAULT_LAYOUT))
     location: Location | None = Field(
         None,
+        validate_default=True,
         description="Where the array is: the name of a site, or coordinates; null: the site of the layout, HERA's for "
         "its arrays and the MWA's for all others. Required for positions from a CSV file.",
     )
@@ -117,14 +123,9 @@ class InstrumentSettings(Section):
     as_built: AsBuilt = AsBuilt()
 
     @property
-    def _own_site(self) -> Any:
-        # `ArrayLayout` has it, which this module cannot import.
-        return getattr(self.layout, "site", None)
-
-    @property
     def site(self) -> Site | Coordinates:
         """The site of the array."""
-        return Site(kind=self._own_site) if self.location is None else self.location
+        return Site(kind=_own_site(self.layout)) if self.location is None else self.location
 
     def nominal(self) -> InstrumentSettings:
         """Return the instrument as designed, which calibrators and figures assume."""
@@ -134,16 +135,18 @@ class InstrumentSettings(Section):
         """Return the nominal instrument with the default beam, for code that reads antennas, channels and times."""
         return self.with_defaults("beam", "antenna_beams", "as_built")
 
-    @model_validator(mode="after")
-    def _positions_of_a_file_have_a_place(self) -> InstrumentSettings:
-        if self._own_site is None and self.location is None:
+    @field_validator("location")
+    @classmethod
+    def _positions_of_a_file_have_a_place(cls, value: Location | None, info: ValidationInfo) -> Location | None:
+        layout = info.data.get("layout")
+        if layout is not None and _own_site(layout) is None and value is None:
             sites = ", ".join(get_args(Site.model_fields["kind"].annotation))
             raise fault(
-                "location",
-                f"is required for instrument.layout {self.layout.label!r}, which is at no site: the name of a site "
+                "",
+                f"is required for instrument.layout {layout.label!r}, which is at no site: the name of a site "
                 f"({sites}), or coordinates (latitude and longitude)",
             )
-        return self
+        return value
 
     @model_validator(mode="after")
     def _polarizations_are_unique(self) -> InstrumentSettings:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.constants import SECONDS_PER_DAY, SPEED_OF_LIGHT
+from calstudy.base.errors import InputError
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import from_cube, subset_template, to_cube
 from calstudy.instrument.layouts import layout_of, size_of_instrument
@@ -190,6 +191,10 @@ class Simulate(_Simulated, stage="simulate", version=3):
         component = self.component
         cubes = (to_cube(read_visibilities(folder / CHUNK)) for folder in self.chunk[: len(component.chunks)])
         data = from_cube(component.template, assemble(component.chunks, cubes))
+        if not np.any(data.data_array):
+            raise InputError(
+                f"{self.label}: no source is above the horizon; use more, or another instrument.times.start_lst"
+            )
         quality: dict[str, Any] = {"interpolation": component.interpolation_error(to_cube(data))}
         if not component.is_eor:
             quality["delay_floor"] = _floors(data)

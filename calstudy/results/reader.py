@@ -31,6 +31,7 @@ from calstudy.experiment.files import read_mapping, validate
 from calstudy.experiment.model import Experiment
 from calstudy.power.score import Score
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
+from calstudy.power.tables import Spectrum as Stored
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 from calstudy.products.files import (
@@ -58,7 +59,16 @@ if TYPE_CHECKING:
 
 
 Spectrum = TypeVar("Spectrum", SphericalSpectrum, CylindricalSpectrum)
+Read = TypeVar("Read")
 NO_SCORES = "the run has no scores of its calibration, or is of a version that wrote none"
+
+
+def _undamaged(path: Path, read: Callable[[Path], Read], remedy: str = "run the experiment again") -> Read:
+    """Read a file of a run; raises InputError, with what can be done, if its content is not that of a run."""
+    try:
+        return read(path)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        raise InputError(f"{path}: is damaged; {remedy}") from None
 
 
 @dataclass(frozen=True)
@@ -77,35 +87,35 @@ class Tables:
 
     def transfer(self, region: str) -> TransferFunction:
         """Return the transfer function of the calibration, "outside-wedge" or "inside-wedge"."""
-        return load_spectrum(self._transfer(TRANSFER, region), TransferFunction)
+        return self._loaded(self._transfer(TRANSFER, region), TransferFunction)
 
     def transfer_in_bands(self, region: str) -> TransferFunction:
         """Return the transfer function in bands of k, "outside-wedge" or "inside-wedge"."""
-        return load_spectrum(self._transfer(TRANSFER_BANDS, region), TransferFunction)
+        return self._loaded(self._transfer(TRANSFER_BANDS, region), TransferFunction)
 
     @property
     def expected_transfer(self) -> ExpectedBins:
         """The transfer function that theory expects of the fit."""
-        return load_spectrum(self.path(EXPECTED, "the run has no expected transfer function"), ExpectedBins)
+        return self._loaded(self.path(EXPECTED, "the run has no expected transfer function"), ExpectedBins)
 
     def transfer_map(self) -> TransferMap:
         """Return the transfer function by baseline length and delay."""
-        return load_spectrum(self._transfer(TRANSFER, "wedge"), TransferMap)
+        return self._loaded(self._transfer(TRANSFER, "wedge"), TransferMap)
 
     @property
     def score(self) -> Score:
         """The scores of the calibration in bins of k, with errors from leaving out antennas."""
-        return load_spectrum(self.path(SCORE_BINS, NO_SCORES), Score)
+        return self._loaded(self.path(SCORE_BINS, NO_SCORES), Score)
 
     @property
     def score_in_bands(self) -> Score:
         """The scores of the calibration in bands of k, likewise."""
-        return load_spectrum(self.path(SCORE_BANDS, NO_SCORES), Score)
+        return self._loaded(self.path(SCORE_BANDS, NO_SCORES), Score)
 
     @property
     def summary(self) -> Mapping[str, Any]:
         """The content of score.json: scores in bands, flux scale, errors of gains, statuses and cost of the solves."""
-        return read_json(self.path(SCORE, NO_SCORES))
+        return _undamaged(self.path(SCORE, NO_SCORES), read_json)
 
     def measured(self, name: str) -> Statistic:
         """Return a comparison of the calibration with the truth (`calstudy.calibrate.agreement`)."""
@@ -118,7 +128,7 @@ class Tables:
     def agreement(self) -> Mapping[str, Any]:
         """The content of agreement.json."""
         missing = "the run has no calibrated variant 'residual' of foregrounds and noise to compare"
-        return read_json(self.path(AGREEMENT, missing))
+        return _undamaged(self.path(AGREEMENT, missing), read_json)
 
     @property
     def variants(self) -> list[str]:
@@ -142,7 +152,11 @@ class Tables:
         return self.path(spectrum_file(name, kind), "the run does not calibrate the same data with the EoR and without")
 
     def _spectrum(self, variant: str, kind: str, cls: type[Spectrum]) -> Spectrum:
-        return load_spectrum(self.path(spectrum_file(variant, kind), f"the run has no variant {variant!r}"), cls)
+        return self._loaded(self.path(spectrum_file(variant, kind), f"the run has no variant {variant!r}"), cls)
+
+    @staticmethod
+    def _loaded(path: Path, kind: type[Stored]) -> Stored:
+        return _undamaged(path, lambda found: load_spectrum(found, kind))
 
 
 @dataclass(frozen=True)
@@ -333,7 +347,7 @@ class RunFolder:
     def shown(self) -> list[Table]:
         """The tables of a report that were made with the products; none in runs of earlier versions."""
         path = self.path / "tables" / SHOWN
-        return from_json(path.read_text(encoding="utf-8")) if path.is_file() else []
+        return _undamaged(path, lambda file: from_json(file.read_text(encoding="utf-8"))) if path.is_file() else []
 
     @property
     def figures(self) -> Path:
@@ -363,13 +377,9 @@ class RunFolder:
         path = self.path / "tables" / COMPARISON
         if not path.is_file():
             return {}
-        try:
-            scores = json.loads(path.read_text(encoding="utf-8"))
-            # Reads all that is needed.
-            standings(scores)
-        except (OSError, ValueError, TypeError, KeyError, AttributeError):
-            raise InputError(f"{path}: is damaged; run the comparison again") from None
-        return scores
+        # Verdicts need all that is read of it.
+        _undamaged(path, lambda file: standings(read_json(file)), "run the comparison again")
+        return read_json(path)
 
     @property
     def has_claims(self) -> bool:
@@ -385,10 +395,7 @@ class RunFolder:
         """Return the verdicts of a JSON file; empty if it does not exist."""
         if not path.is_file():
             return []
-        try:
-            return verdicts_from_json(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, TypeError, KeyError):
-            raise InputError(f"{path}: is damaged; {remedy}") from None
+        return _undamaged(path, lambda file: verdicts_from_json(file.read_text(encoding="utf-8")), remedy)
 
 
 def find_runs(folder: Path) -> list[RunFolder]:

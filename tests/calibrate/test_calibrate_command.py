@@ -250,7 +250,7 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
         ),
         (["data.uvh5", "--redundant", "--gains-only"], "--redundant and --gains-only: choose one"),
         (["data.uvh5", "--gains-only"], "calibration.calibrator = 'sky-based': needs a sky model"),
-        (["data.uvh5", "--gains-only", *OPTIONS], "calibration.basis: unknown key"),
+        (["data.uvh5", "--gains-only", *OPTIONS], "calibration.basis: 'sky-based' has no such key, but calamity"),
         (["data.uvh5", "--gains", "no.calh5"], "calibration.initial_gains.path = 'no.calh5': no such file"),
         (["data.uvh5", "--weights", "no.h5"], "--weights no.h5: neither gains, flags, nsamples or autos, nor a file"),
         (["data.uvh5", "--select", "antennas=3"], "--select antennas: '3' is not in the data"),

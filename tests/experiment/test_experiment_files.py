@@ -126,6 +126,7 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
             "outputs.figures: asks for 'gains', which needs variants.residual to have foregrounds, effects: true and",
         ),
         ("{}", "name: missing, and it has no default"),
+        ("{name: a, corruption: {noise: {factor: 1.0e+300}}}", "corruption.noise.factor = 1e+300: must be at most"),
         ("{name: a b}", "name: 'a b' cannot name a folder"),
         (
             "{name: a, calibration: {solver: {max_steps: 0}, basis: {bufer: 3}}}",
@@ -133,7 +134,11 @@ def test_the_resolved_file_reads_back_to_the_same_experiment(path, tmp_path):
         ),
         (
             "{name: a, calibration: {calibrator: sky-based, basis: {buffer: 10 ns}}}",
-            "calibration.basis: unknown key, did you mean 'baselines'? (allowed: assumed, autos, baselines,",
+            "calibration.basis: 'sky-based' has no such key, but calamity, calamity-redundant, delay-weighted, ",
+        ),
+        (
+            "{name: a, instrument: {layout: {kind: hex, side: 3, spacing: 14 m, count: 16}}}",
+            "instrument.layout.count: 'hex' has no such key, but golomb,",
         ),
     ],
 )

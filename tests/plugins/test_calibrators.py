@@ -176,7 +176,7 @@ def test_the_calibrate_command_uses_it(reference, observed, tmp_path, capsys, mo
         ),
         (["--set", "max_length=20", "--sky-model", "sky.uvh5"], "calibration.max_length: 20 has no unit"),
         ([], "needs a sky model"),
-        (["--buffer", "50 ns"], "calibration.basis: unknown key"),
+        (["--buffer", "50 ns"], "has no such key, but calamity, "),
         (["--expected-loss", "--sky-model", "sky.uvh5"], "--expected-loss: is known for fits by least squares"),
         (["--set", "fault=value", "--sky-model", "sky.uvh5"], "line 44, in spoiled: ValueError: no such thing"),
     ],

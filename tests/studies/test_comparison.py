@@ -153,6 +153,8 @@ def test_the_answer_is_on_the_report_and_in_python(compared, summaries):
     assert found.worlds["sky-based"] == ["flux errors: 20 %"]
     lowest = min(summaries[world]["CALAMITY"]["bands"][1]["transfer"] for world in WORLDS)
     assert found.transfer["CALAMITY"] == lowest
+    with pytest.raises(InputError, match="limit = 0: must be greater than 0"):
+        calstudy.open_run(compared.folder).standings(limit=0)
     assert calstudy.open_run(compared.folder).standings(limit=1e9).loc[(0.2, 0.5)].standing["sky-based"] == "passes"
     page = (compared.folder / "report.html").read_text()
     assert page.index("Which calibrator to trust") < page.index("Scores: ideal")
@@ -173,9 +175,14 @@ def test_faults_name_the_case_and_the_field(tmp_path):
         load_study(comparison_file(tmp_path, figures=["wedge"]))
     with pytest.raises(ExperimentError, match="wrlds: unknown key, did you mean 'worlds'"):
         load_study(comparison_file(tmp_path, wrlds={}))
+    with pytest.raises(ExperimentError, match="experiment = 3: must be a block of keys"):
+        load_study(comparison_file(tmp_path, experiment=3))
+    with pytest.raises(ExperimentError, match="scales = 3: must be a block of keys"):
+        load_study(comparison_file(tmp_path, scales=3))
     # Every case is held to the same yardstick, with the calibrator of its label, and no block is lost.
     for changes, sentence in {
         "calibration.calibrator: none": "'a' changes the calibrator",
+        "name: mine": "'a' changes name, which has no effect",
         "power.taper: none": "'a' changes power.taper; all cases are measured alike",
         "instrument: {as_built: {}}": r"'a' replaces all of instrument; .* \(instrument.as_built\)",
     }.items():

@@ -52,7 +52,7 @@ NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 CALIBRATOR = f"calibration.{CALIBRATORS.tag}"
 OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
 """Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
-WITHOUT_EFFECT = ("papers", "outputs.figures", "outputs.tables", *NOT_SHARED[1:])
+WITHOUT_EFFECT = ("name", "description", "papers", "outputs.figures", "outputs.tables", *NOT_SHARED[1:])
 """Fields of an experiment that make nothing in a comparison, whose cases have scores alone."""
 VARIANTS_NEEDED = (
     "variants: must have residual and residual_without_eor, calibrated and different in the EoR alone, and eor"
@@ -218,7 +218,8 @@ class Comparison(Family):
             applied to the experiment of every case.
         calibrators : in place of those of the file
         """
-        own = file.scale if file.scale in (file.content.get("scales") or {}) else None
+        scales = file.content.get("scales")
+        own = file.scale if isinstance(scales, dict) and file.scale in scales else None
         data = apply_scale(file.content, own)
         changes = dict(parse_override(text) for text in file.overrides)
         for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
