@@ -166,11 +166,7 @@ class Transfer(Injected, stage="transfer", version=5, cost=Cost(1, disk=1e6)):
         known = read_json(self.scale / SCALE)["flux_scale"]
         scale = math.nan if known is None else known
         summary = write_transfer(output, self.read(), self.power, scale)
-        residual, signal = (
-            load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
-            for name in ("residual", "eor")
-        )
-        write_corrected(output, residual, signal)
+        write_corrected(output, *spectra.read_recovered(self.spectra))
         return {"transfer": summary, "flux_scale": _json(scale)}
 
 

@@ -14,7 +14,7 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
 from calstudy.power.binned import cylindrical_average, noise_level, spherical_average, with_errors
 from calstudy.power.interface import estimate_spectra, polarizations_without_data
-from calstudy.power.spectra import DelaySpectra
+from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
@@ -169,6 +169,12 @@ class Power(Task, stage="power", version=4):
 def read_delay_spectra(folder: Path) -> DelaySpectra:
     """Read a product of the stage `power`."""
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
+
+
+def read_recovered(folder: Path) -> list[SphericalSpectrum]:
+    """Read P^R and P^S outside the wedge from a product of the stage `spectra`."""
+    files = (folder / spectrum_file(name, "outside-wedge") for name in ("residual", "eor"))
+    return [load_spectrum(file, SphericalSpectrum) for file in files]
 
 
 class Spectra(Task, stage="spectra", version=4):

@@ -235,10 +235,10 @@ class Family(Study):
         )
 
 
-def content_of(experiment: Experiment) -> Any:
-    """Return the content that decides the run folder of an experiment."""
-    outputs = experiment.outputs.with_defaults("store", "runs")
-    return identity(experiment.model_copy(update={"outputs": outputs}).with_defaults("scales"))
+def content_of(file: Any) -> Any:
+    """Return the content that decides the run folder of an experiment, or of a file about measured data."""
+    outputs = file.outputs.with_defaults("store", "runs")
+    return identity(file.model_copy(update={"outputs": outputs}).with_defaults("scales"))
 
 
 def what_is_made(experiment: Experiment) -> Experiment:

@@ -8,7 +8,6 @@ from typing import Any, Self
 from pydantic import Field
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Scales
@@ -23,6 +22,7 @@ from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataFile, DataStudy, read_file, read_selected
+from calstudy.studies.kinds.experiment import content_of
 
 DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
@@ -84,8 +84,7 @@ class ObservedStudy(DataStudy):
     @property
     def content(self) -> Any:
         """The content of the file without scales and the folders of outputs."""
-        outputs = self.file.outputs.with_defaults("store", "runs")
-        return identity(self.file.model_copy(update={"outputs": outputs}).with_defaults("scales"))
+        return content_of(self.file)
 
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study fitted to a budget, and the number of workers; also refuse a beam that cannot be made."""
