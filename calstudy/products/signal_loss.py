@@ -18,7 +18,7 @@ from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.delay import make_taper
 from calstudy.power.spectra import SphericalSpectrum, of_common_units
-from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_transfer_csv
+from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_csv
 from calstudy.power.transfer import (
     BANDS,
     Injection,
@@ -186,7 +186,7 @@ def write_transfer(
             measured = spherical_transfer(injection, edges, buffer, inside, scale)
             found = where_measured(measured) if only_measured else measured
             save_spectrum(folder / spectrum_file(name, region), found)
-            write_transfer_csv(folder / f"{name}.{region}.csv", found)
+            write_csv(folder / f"{name}.{region}.csv", found)
         summary[region] = [
             {
                 "k": [low, high],
