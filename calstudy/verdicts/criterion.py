@@ -29,50 +29,49 @@ class Finding(NamedTuple):
     kind: Kind = "error"
 
 
-class _Bounds:
-    """From `low` to `high`, by `sigmas` times the uncertainty."""
-
-    low: float
-    high: float
-    sigmas: float
-
-    def holds(self, finding: Finding) -> bool:
-        """Return true if the value is between the bounds, that far from both."""
-        margin = self.sigmas * finding.uncertainty
-        return finding.value - margin >= self.low and finding.value + margin <= self.high
-
-
 @dataclass(frozen=True)
-class Within(_Bounds):
+class Within:
     """From `low` to `high`."""
 
     low: float
     high: float
     sigmas: ClassVar[float] = 0.0
 
+    def holds(self, finding: Finding) -> bool:
+        """Return true if the value is in the interval."""
+        return self.low <= finding.value <= self.high
+
     def __str__(self) -> str:
         return f"from {self.low:.3g} to {self.high:.3g}"
 
 
 @dataclass(frozen=True)
-class AtLeast(_Bounds):
+class AtLeast:
     """At least `low`, by `sigmas` times the uncertainty."""
 
     low: float
     sigmas: float = 0.0
     high: ClassVar[float] = math.inf
 
+    def holds(self, finding: Finding) -> bool:
+        """Return true if the value is that far above the bound."""
+        return finding.value - self.sigmas * finding.uncertainty >= self.low
+
     def __str__(self) -> str:
         return f">= {self.low:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
 
 
 @dataclass(frozen=True)
-class AtMost(_Bounds):
+class AtMost:
     """At most `high`, by `sigmas` times the uncertainty."""
 
     high: float
     sigmas: float = 0.0
     low: ClassVar[float] = -math.inf
+
+    def holds(self, finding: Finding) -> bool:
+        """Return true if the value is that far below the bound."""
+        return finding.value + self.sigmas * finding.uncertainty <= self.high
 
     def __str__(self) -> str:
         return f"<= {self.high:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
