@@ -6,6 +6,9 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+from calstudy.experiment.files import StudyFile
+from calstudy.experiment.model import Experiment
+
 TINY: dict[str, Any] = {
     "name": "tiny",
     "instrument": {
@@ -31,3 +34,8 @@ def tiny(folder: Path) -> dict[str, Any]:
 def of_the_paper(folder: Path) -> dict[str, Any]:
     """Return the tiny experiment with the weights of Ewall-Wice et al. (2022), compared with what they say."""
     return {**tiny(folder), "papers": ["calamity2022"]}
+
+
+def load(path: Path, scale: str | None = None, overrides: tuple[str, ...] = ()) -> Experiment:
+    """Read and validate an experiment file."""
+    return StudyFile.open(path, scale, overrides).experiment()

@@ -99,12 +99,7 @@ class ExpectedTransfer:
 
 
 def expected_transfer(
-    problem: CalibrationProblem,
-    gains: np.ndarray,
-    model: np.ndarray,
-    modes: DelayModes,
-    probes: int | None = None,
-    seed: int = 0,
+    problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, modes: DelayModes, probes: int | None = None
 ) -> ExpectedTransfer:
     """Predict the fraction of a white signal that a fit preserves, for every baseline and delay.
 
@@ -118,8 +113,6 @@ def expected_transfer(
         The delay modes of its channels.
     probes
         Number of random vectors; None for the exact diagonal.
-    seed
-        Seed of the random vectors.
 
     Raises
     ------
@@ -132,7 +125,7 @@ def expected_transfer(
     if probes is None:
         by_gains, error = _exact_diagonal(problem, gains, tangent, modes), np.zeros((len(norm), modes.delay.size))
     else:
-        by_gains, error = _stochastic_diagonal(problem, gains, tangent, modes, probes, seed)
+        by_gains, error = _stochastic_diagonal(problem, gains, tangent, modes, probes)
     norm = np.where(norm > 0, norm, np.nan)
     foregrounds, by_gains, error = _foreground_diagonal(tangent, modes) / norm, by_gains / norm, error / norm
     return ExpectedTransfer(modes.delay, 1 - foregrounds - by_gains, error, foregrounds, by_gains)
@@ -306,7 +299,7 @@ def linear_response(
 
 
 def _stochastic_diagonal(
-    problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes, probes: int, seed: int
+    problem: CalibrationProblem, gains: np.ndarray, tangent: TangentSpace, modes: DelayModes, probes: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate <f|P|f> of the gains and its standard deviation, (Nbls, Ndelays) each.
 
@@ -314,7 +307,7 @@ def _stochastic_diagonal(
     """
     if probes < 2:
         raise ValueError(f"probes: {probes}, at least 2 are needed")
-    response, rng = GainResponse(problem, gains), np.random.default_rng(seed)
+    response, rng = GainResponse(problem, gains), np.random.default_rng(0)
     shape, used = tangent.slope.shape, tangent.roots > 0
     sums = np.zeros((2, shape[0], modes.delay.size))
     for _ in range(probes):

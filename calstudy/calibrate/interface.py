@@ -119,6 +119,19 @@ class Smoothing(Section):
         description="Number of the antenna whose phase is made zero in every channel before; null: phases are smoothed "
         "as the calibrator leaves them.",
     )
+    axes: ClassVar[tuple[str, str]] = ("frequency_scale", "time_scale")
+    """The fields of which one at least is given."""
+
+    @model_validator(mode="after")
+    def _smooths(self) -> Self:
+        if all(getattr(self, name) is None for name in self.axes):
+            raise fault("", f"needs a {self.axes[0]}, a {self.axes[1]}, or both")
+        return self
+
+    @property
+    def over_time(self) -> bool:
+        """Whether integrations are smoothed together."""
+        return getattr(self, self.axes[1]) is not None
 
 
 class DpssSmoothing(Smoothing):
@@ -132,17 +145,6 @@ class DpssSmoothing(Smoothing):
         None, gt=0, description="Rates beyond its inverse are removed; null: integrations are left as they are."
     )
 
-    @model_validator(mode="after")
-    def _smooths(self) -> Self:
-        if self.frequency_scale is None and self.time_scale is None:
-            raise fault("", "needs a frequency_scale, a time_scale, or both")
-        return self
-
-    @property
-    def over_time(self) -> bool:
-        """Whether integrations are smoothed together."""
-        return self.time_scale is not None
-
 
 class PolynomialSmoothing(Smoothing):
     """Least-squares fit of polynomials in frequency and in time."""
@@ -150,17 +152,7 @@ class PolynomialSmoothing(Smoothing):
     kind: Literal["polynomial"]
     frequency_degree: int | None = Field(None, ge=0, description="Null: channels are left as they are.")
     time_degree: int | None = Field(None, ge=0, description="Null: integrations are left as they are.")
-
-    @model_validator(mode="after")
-    def _smooths(self) -> Self:
-        if self.frequency_degree is None and self.time_degree is None:
-            raise fault("", "needs a frequency_degree, a time_degree, or both")
-        return self
-
-    @property
-    def over_time(self) -> bool:
-        """Whether integrations are smoothed together."""
-        return self.time_degree is not None
+    axes: ClassVar[tuple[str, str]] = ("frequency_degree", "time_degree")
 
 
 class SmoothCal(Smoothing):
@@ -169,11 +161,6 @@ class SmoothCal(Smoothing):
     kind: Literal["smooth-cal"]
     frequency_scale: Frequency = Field(10e6, gt=0, description="Delays beyond its inverse are removed.")
     time_scale: Time = Field(1800.0, gt=0, description="Rates beyond its inverse are removed.")
-
-    @property
-    def over_time(self) -> bool:
-        """Always true."""
-        return True
 
 
 SmoothGains = Annotated[DpssSmoothing | PolynomialSmoothing | SmoothCal, choice("kind", "dpss")]

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
-from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
+from calstudy.corrupt.effects.gains import ReflectionGains
+from calstudy.power.spectra import SphericalSpectrum
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
-    from calstudy.results.reader import Results
+    from calstudy.experiment.model import Experiment
+    from calstudy.results.reader import Results, Tables
 
 
 TINY = 1e-9
 """Tolerance of the limits of a range of k, h/Mpc: a bin belongs to one range, whatever the rounding of its centre."""
+REFLECTION_WIDTH = 2
+"""Reflections are searched for within this many standard deviations of their mean delay."""
 
 
 def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np.inf) -> np.ndarray:
@@ -36,12 +40,17 @@ def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np
     return used
 
 
-def bins_at_delays(spectrum: SphericalSpectrum, wedge: CylindricalSpectrum, low: float, high: float) -> np.ndarray:
-    """Return the bins of k, (Nk,) bool, of the positive delays from `low` to `high` (s).
+def reflection_bins(run: Tables, experiment: Experiment, spectrum: SphericalSpectrum) -> np.ndarray:
+    """Return the bins of k, (Nk,) bool, of the positive delays of the reflections of an experiment.
 
-    The wedge, a cylindrical spectrum of the same experiment, relates delays to wavenumbers. Raises Unevaluated if
+    They are within two standard deviations of the mean delay. Raises Unevaluated if the gains have no reflections, or
     the delays are in no bin with modes.
     """
+    gains = experiment.corruption.gains
+    if not isinstance(gains, ReflectionGains):
+        raise Unevaluated("the gains have no reflections")
+    low, high = (gains.delay + sign * REFLECTION_WIDTH * gains.delay_scatter for sign in (-1, 1))
+    wedge = run.wedge("noise")
     per_second = wedge.k_parallel[-1] / wedge.delay[-1]
     chosen = (spectrum.bin_edges[1:] > low * per_second) & (spectrum.bin_edges[:-1] < high * per_second)
     chosen &= used_bins(spectrum)

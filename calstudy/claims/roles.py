@@ -33,7 +33,26 @@ SMOOTH = 100e-9
 """Largest delay of gains that are smooth in frequency, s."""
 
 
-def other_calibrator(experiment: Experiment, allowed: Sequence[str]) -> str | None:
+def unsuitable(
+    experiment: Experiment,
+    calibrators: Sequence[str],
+    *others: str | None,
+    incomplete: bool | None,
+    fault: str | None = None,
+) -> str | None:
+    """Return the first refusal of an experiment, or None.
+
+    The calibrator must be one of `calibrators`, and weights must be inverse variances or gains smooth in frequency;
+    there may be no fault but one (its field of the instrument as built), and the sky model must be `incomplete` or
+    complete, or may be any (None). Refusals of a paper's own, `others`, come after that of the calibrator.
+    """
+    sky_model = None if incomplete is None else _other_sky_model(experiment, incomplete)
+    found = (_other_weights(experiment), _other_faults(experiment, fault), sky_model)
+    refusals = (_other_calibrator(experiment, calibrators), *others, *found)
+    return next((refusal for refusal in refusals if refusal is not None), None)
+
+
+def _other_calibrator(experiment: Experiment, allowed: Sequence[str]) -> str | None:
     """Return a refusal of an experiment with none of the allowed calibrators, or None."""
     found = experiment.calibration.label
     return None if found in allowed else f"calibration.calibrator is {found!r}, not {' or '.join(map(repr, allowed))}"
@@ -57,7 +76,7 @@ def _is_smooth(effect: Bandpass) -> bool:
     return True
 
 
-def other_weights(experiment: Experiment) -> str | None:
+def _other_weights(experiment: Experiment) -> str | None:
     """Return a refusal if the weights are not inverse variances and the gains are not smooth, or None.
 
     With such weights, a smooth error of the model causes white errors of the gains, and no paper is about these.
@@ -69,7 +88,7 @@ def other_weights(experiment: Experiment) -> str | None:
     return f"calibration.weights is {calibration.weights.kind!r}, which is no inverse variance, and {rough}"
 
 
-def other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
+def _other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
     """Return a refusal of the sky model, or None.
 
     With `incomplete`, sources have to be missing and no other assumption may be wrong; otherwise the sky model has
@@ -84,7 +103,7 @@ def other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
     return f"calibration.assumed: {'no sources are missing' if incomplete else f'has {next(iter(changes))}'}"
 
 
-def other_faults(experiment: Experiment, allowed: str | None = None) -> str | None:
+def _other_faults(experiment: Experiment, allowed: str | None = None) -> str | None:
     """Return in words a fault of the instrument as built or of the data, besides gains, or None.
 
     A role may require a fault in the field `allowed` of `instrument.as_built`, such as "dipoles.dead_tiles".
@@ -129,8 +148,3 @@ def require_same_world(first: Results, second: Results) -> None:
             raise Unevaluated(f"the runs differ in {section}")
     if assumed_changes(one.calibration.assumed) != assumed_changes(other.calibration.assumed):
         raise Unevaluated("the runs differ in calibration.assumed")
-
-
-def first_refusal(*refusals: str | None) -> str | None:
-    """Return the first reason that is not None."""
-    return next((refusal for refusal in refusals if refusal is not None), None)

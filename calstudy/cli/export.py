@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from calstudy.base.errors import InputError
 from calstudy.cli.options import AsJson, MaxMemory, Overwrite, Scale, Set, StudyFile, Workers
 
 Format = Annotated[str, typer.Option("--format", help="uvh5, uvfits or ms (which takes python-casacore).")]
@@ -117,7 +118,6 @@ def score(
 
 def _require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if the file of scores cannot be written."""
-    from calstudy.base.errors import InputError
     from calstudy.run.store import require_writable
 
     if output.is_dir():
@@ -129,7 +129,6 @@ def _require_free(output: Path, overwrite: bool) -> None:
 
 def _blocks(folder: Path | None, calibrator: str | None, name: str | None) -> dict[str, Any] | None:
     """Return the calibrator to be scored by its label, or None for those of the file."""
-    from calstudy.base.errors import InputError
     from calstudy.experiment.files import parse_yaml
 
     if folder is not None and calibrator is not None:

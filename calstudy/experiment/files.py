@@ -160,6 +160,14 @@ def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     return with_value(data, path, value, _block_for)
 
 
+def overridden(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of `data` with fields set by dotted path, one after the other; see `override`."""
+    result = dict(data)
+    for path, value in changes.items():
+        result = override(result, path, value)
+    return result
+
+
 def _block_for(path: str, given: Any) -> dict[str, Any] | list[Any] | None:
     """Return the block for a name that stands for it, or the list or the empty block for a missing value."""
     if isinstance(given, str):
@@ -181,17 +189,14 @@ def short_names(paths: Sequence[str]) -> dict[str, str]:
 
 def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
     """Return `data` with the overrides of the named scale applied; raises InputError if the file has no such scale."""
-    result = dict(data)
     if scale is None:
-        return result
+        return dict(data)
     scales = data.get("scales") or {}
     if not isinstance(scales, dict) or not isinstance(scales.get(scale), dict):
         names = [name for name in scales if isinstance(scales[name], dict)] if isinstance(scales, dict) else []
         listed = f"the file has: {', '.join(names)}" if names else "the file has no scales"
         raise InputError(f"--scale {scale}: not a scale of this experiment{nearest(scale, names)} ({listed})")
-    for path, value in scales[scale].items():
-        result = override(result, path, value)
-    return result
+    return overridden(data, scales[scale])
 
 
 def _require_scales(data: Mapping[str, Any], base: Path, valid: Sequence[str | None] = ()) -> None:
@@ -328,21 +333,6 @@ class StudyFile:
         return experiment
 
 
-def load(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Experiment:
-    """Read and validate an experiment file.
-
-    Raises InputError if the file cannot be read or an override cannot be applied, and ExperimentError if fields are
-    unknown or missing, or have invalid values.
-
-    Parameters
-    ----------
-    path : the YAML file
-    scale : name of a set of overrides in the file's `scales`
-    overrides : ``path=value`` texts, applied after the scale
-    """
-    return StudyFile.open(path, scale, overrides).experiment()
-
-
 def with_absolute_paths(content: Any, read: Iterable[BaseModel], folder: Path) -> Any:
     """Return the content of a file with absolute paths of plug-ins and input files, which start at a folder.
 
@@ -377,5 +367,5 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def dump(content: BaseModel) -> str:
-    """Return the content of a file as YAML; an experiment is read back by `load` as the same experiment."""
+    """Return the content of a file as YAML; an experiment is read back as the same experiment."""
     return yaml.safe_dump(content.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)

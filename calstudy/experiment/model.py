@@ -237,18 +237,16 @@ class Experiment(Section):
         return self
 
     @model_validator(mode="after")
-    def _a_finite_prior_has_noise(self) -> Experiment:
-        if self.corruption.noise.kind == "none" and self.calibration.needs_noise:
+    def _what_needs_noise_has_it(self) -> Experiment:
+        if self.corruption.noise.kind != "none":
+            return self
+        if self.calibration.needs_noise:
             raise fault(
                 "corruption.noise",
                 "is 'none', and the finite deviations of calibration.foreground_prior are weighed against noise: give "
                 "calibration.foreground_prior.noise, or let there be noise",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _autocorrelations_are_noise(self) -> Experiment:
-        if self.corruption.noise.kind == "none" and self.calibration.needs_autos:
+        if self.calibration.needs_autos:
             raise fault(
                 "calibration.weights",
                 "is 'autos', and without corruption.noise there are no autocorrelations: choose other weights, or let "

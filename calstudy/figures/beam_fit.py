@@ -21,7 +21,6 @@ from calstudy.run.task import Job
 from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pyuvdata import UVData
 
@@ -216,7 +215,8 @@ def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float
         colour = INTERPOLATION_COLOURS[name]
         left.plot(floor.delay * 1e9, 10 * np.log10(floor.spectrum), color=colour, linewidth=0.8, label=name)
         for taper, line in LINES.items():
-            _draw_steps(right, floor, taper, colour, line)
+            steps = floor.floors[taper]
+            right.stairs(steps.rms_db, steps.edges, baseline=None, linewidth=1.0, color=colour, linestyle=line)
     horizon = next(iter(floors.values())).horizon
     left.axvline(horizon * 1e9, color=style.BLACK, linestyle="--", linewidth=0.7)
     for axes in (left, right):
@@ -233,11 +233,6 @@ def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float
     right.legend(loc="upper right")
     left.legend(loc="upper right")
     return figure
-
-
-def _draw_steps(axes: Axes, floor: InterpolationFloor, taper: str, colour: str, line: str) -> None:
-    measured = floor.floors[taper]
-    axes.stairs(measured.rms_db, measured.edges, baseline=None, linewidth=1.0, color=colour, linestyle=line)
 
 
 class DelayFloorFigure(StudyFigure):

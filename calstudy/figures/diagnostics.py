@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from calstudy.base.gains import find_gain_errors
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, rows_of, to_cube
-from calstudy.calibrate.basis import channel_grid
+from calstudy.calibrate.basis import ChannelGrid, channel_grid
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.power.delay import horizon_delay
+from calstudy.plotting.axes import TAPER
+from calstudy.power.delay import horizon_delay, make_taper
 from calstudy.products.calibration import read_result
 from calstudy.products.files import DATA, GAINS, read_visibilities
 from calstudy.products.gain_errors import observed_gain_errors
@@ -76,21 +77,16 @@ class Diagnostics:
     chi2_by_integration: np.ndarray
 
 
-def delay_rms(cube: np.ndarray, positions: np.ndarray, n_channels: int) -> np.ndarray:
-    """Return the rms over integrations of the tapered delay transform, (Nbls, n_channels).
+def _delay_rms(cube: np.ndarray, grid: ChannelGrid) -> np.ndarray:
+    """Return the rms over integrations of the tapered delay transform, (Nbls, n_channels of the grid).
 
-    `cube` holds visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs); `positions` are channel numbers on an even
-    grid of `n_channels`, (Nfreqs,). A tone at a delay of the transform keeps its amplitude.
+    `cube` holds visibilities, zero where flagged, (Ntimes, Nbls, Nfreqs). A tone at a delay of the transform keeps its
+    amplitude.
     """
-    from scipy.signal.windows import blackmanharris
-
-    taper = blackmanharris(n_channels)
-    power = np.zeros((cube.shape[1], n_channels))
-    for integration in cube:
-        spectra = np.zeros((cube.shape[1], n_channels), complex)
-        spectra[:, positions] = integration
-        power += np.abs(np.fft.fftshift(np.fft.ifft(spectra * taper, axis=-1), axes=-1)) ** 2
-    return np.sqrt(power / len(cube)) * n_channels / taper.sum()
+    taper = make_taper(TAPER, grid.n_channels)
+    # One integration after the other, for the memory.
+    power: Any = sum(np.abs(np.fft.ifft(grid.filled(integration) * taper, axis=-1)) ** 2 for integration in cube)
+    return np.fft.fftshift(np.sqrt(power / len(cube)), axes=-1) * grid.n_channels / taper.sum()
 
 
 @style.journal_style()
@@ -241,7 +237,7 @@ def diagnose(
     flags = flag_cube(result.residual)[..., polarization]
     measured = np.where(flags, 0, to_cube(data)[..., polarization][:, rows])
     spectra = [
-        delay_rms(np.where(flags, 0, cube)[:, order], grid.positions, grid.n_channels)
+        _delay_rms(np.where(flags, 0, cube)[:, order], grid)
         for cube in (measured, to_cube(model)[..., polarization], to_cube(result.residual)[..., polarization])
     ]
     antennas, gains, shown_errors = _shown_gains(result, errors, polarization)

@@ -16,8 +16,9 @@ from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.comparison import COLOURS, MARKERS
 from calstudy.plotting import style
 from calstudy.power.gain_bias import GainBias, tolerated_sigma
+from calstudy.power.tables import load_spectrum
 from calstudy.products.comparison import case_name, read_cases
-from calstudy.products.gain_bias import gain_bias, read_gain_bias
+from calstudy.products.gain_bias import GAIN_BIAS, gain_bias
 from calstudy.products.graph import required
 from calstudy.products.score import score
 from calstudy.run.task import Job, Task
@@ -240,6 +241,6 @@ class GainTolerance(StudyFigure):
         worlds = {}
         for row, (world, found) in enumerate(read_cases([first], job.settings["worlds"], job.inputs).items()):
             bands = found[first].bands
-            law = read_gain_bias(job.inputs[f"law:{case_name(row, 0)}"])
+            law = load_spectrum(job.inputs[f"law:{case_name(row, 0)}"] / GAIN_BIAS, GainBias)
             worlds[world] = tolerated(law, bands.bias, bands.bias_error)
         return Drawing(draw_gain_tolerance(worlds, job.settings.get("eor_level"), self.published), worlds)

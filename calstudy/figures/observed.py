@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.signal_loss import TRANSFER, draw_map, draw_transfer
+from calstudy.figures.signal_loss import TRANSFER, SignalLoss, draw_map, draw_transfer
 from calstudy.figures.spherical import Marking, draw_points, magnitudes
 from calstudy.figures.wedge import draw_wedge
 from calstudy.plotting import style
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calstudy.power.spectra import SphericalSpectrum
-    from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 
 
 MARKINGS = {
@@ -136,25 +134,8 @@ class ObservedWedge(StudyFigure):
         return Drawing(figure, found)
 
 
-LAST_K = 1.5
-
-
-@dataclass(frozen=True)
-class ObservedLoss:
-    """Transfer functions of a calibration of measured data.
-
-    `outside` and `inside` the wedge are per |k| and `map` per baseline length and delay, by injection; `expected` is
-    the prediction of the fit, None if not known.
-    """
-
-    outside: TransferFunction
-    inside: TransferFunction
-    map: TransferMap
-    expected: ExpectedBins | None
-
-
 @style.journal_style()
-def draw_observed_loss(loss: ObservedLoss, buffer: float) -> Figure:
+def draw_observed_loss(loss: SignalLoss, buffer: float) -> Figure:
     """Draw T per |k| on the left, with the expectation outside the wedge as a line, and per (|b|, tau) on the right.
 
     Bars are 95 % (1.96 sigma). The dashed line is the horizon plus `buffer`, s.
@@ -168,9 +149,7 @@ def draw_observed_loss(loss: ObservedLoss, buffer: float) -> Figure:
     if loss.expected is not None:
         label = f"expected of the fit, outside {where}"
         left.plot(loss.expected.k, loss.expected.outside, color=style.BLUE, linewidth=0.9, label=label)
-    filled = np.isfinite(loss.outside.transfer) | np.isfinite(loss.inside.transfer)
-    last = min(float(loss.outside.bin_edges[1:][filled].max(initial=0.1)), LAST_K)
-    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, last), ylim=(-0.03, 1.15))
+    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, loss.last_k), ylim=(-0.03, 1.15))
     left.legend(loc="lower right")
     draw_map(figure, right, loss.map, buffer, MAX_DELAY)
     return figure
@@ -200,5 +179,5 @@ class ObservedSignalLoss(StudyFigure):
         tables = Tables(tuple(job.inputs.values()))
         outside, inside = (tables.transfer(region) for region in REGIONS)
         expected = tables.expected_transfer if "expected" in job.inputs else None
-        loss = ObservedLoss(outside, inside, tables.transfer_map(), expected)
+        loss = SignalLoss(outside, inside, tables.transfer_map(), expected)
         return Drawing(draw_observed_loss(loss, job.settings["wedge_buffer"]), loss)

@@ -166,7 +166,21 @@ def _quoted(arrays: Arrays, name: str) -> np.ndarray:
     return arrays[name.replace(".values.", ".quoted.")]
 
 
-class Realizations(StudyFigure):
+class _OfRealizations(StudyFigure):
+    """A figure of the measurements on every realization of an experiment, or of a member of a collection."""
+
+    max_k: Wavenumber = Field(1.0, gt=0, description="Upper end of the axes of k; the arrays have all bins.")
+
+    def inputs(self, graph: Graph) -> Mapping[str, Task]:
+        """Return the measurements on every realization."""
+        return realizations.inputs(graph)
+
+    def settings(self, graph: Graph) -> Mapping[str, Any]:
+        """Return the draws of each realization."""
+        return realizations.settings(graph)
+
+
+class Realizations(_OfRealizations):
     """Statistics of the realizations of an experiment: T, pulls, coverage, and the correlation between bins."""
 
     kind: str = "realizations"
@@ -183,16 +197,6 @@ class Realizations(StudyFigure):
         (r".*\.(k|bin_edges|input)", Fixed("follows from the settings and the level of the EoR")),
         (".*", Measured("follows from the values of the realizations")),
     )
-
-    max_k: Wavenumber = Field(1.0, gt=0, description="Upper end of the axes of k; the arrays have all bins.")
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the measurements on every realization."""
-        return realizations.inputs(graph)
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the draws of each realization."""
-        return realizations.settings(graph)
 
     def draw(self, job: Job) -> Drawing:
         """Pool all realizations, and draw them."""
@@ -250,7 +254,7 @@ def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_
     return figure
 
 
-class RealizationsComparison(StudyFigure):
+class RealizationsComparison(_OfRealizations):
     """T of two arrays over the same draws, and their difference, with realizations-comparison.csv."""
 
     kind: str = "realizations-comparison"
@@ -262,16 +266,6 @@ class RealizationsComparison(StudyFigure):
         "scatter of one realization, and the mean difference with 95 % bars that include all that was drawn."
     )
     tolerances = ((".*", Measured("follows from the figures of the members")),)
-
-    max_k: Wavenumber = Field(1.0, gt=0, description="Upper end of the axis of k; the arrays have all bins.")
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the measurements on every realization of one member."""
-        return realizations.inputs(graph)
-
-    def settings(self, graph: Graph) -> Mapping[str, Any]:
-        """Return the draws of each realization."""
-        return realizations.settings(graph)
 
     def draw(self, job: Job) -> Drawing:
         """Write the table, and draw both arrays and their difference."""

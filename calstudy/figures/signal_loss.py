@@ -42,11 +42,21 @@ EMPTY = "0.8"
 
 @dataclass(frozen=True)
 class SignalLoss:
-    """The transfer functions of one calibration: per |k| outside and inside the wedge, and per length and delay."""
+    """The transfer functions of one calibration: per |k| outside and inside the wedge, and per length and delay.
+
+    For measured data also what is `expected` of the fit, None if not known.
+    """
 
     outside: TransferFunction
     inside: TransferFunction
     map: TransferMap
+    expected: ExpectedBins | None = None
+
+    @property
+    def last_k(self) -> float:
+        """The end of the last bin with modes, at most 1.5 h/Mpc."""
+        filled = np.isfinite(self.outside.transfer) | np.isfinite(self.inside.transfer)
+        return min(float(self.outside.bin_edges[1:][filled].max(initial=0.1)), 1.5)
 
 
 @style.journal_style()
@@ -82,7 +92,7 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
         zorder=1,
         label=SCALE_FREE.format(loss.outside.flux_scale),
     )
-    axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, _last_k(loss)), ylim=_limits(loss))
+    axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, loss.last_k), ylim=_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
     # The points, which matter most, come first in the legend; the line would by default.
     axes.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="center right")
@@ -102,12 +112,6 @@ def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, c
         elinewidth=0.7,
         label=label,
     )
-
-
-def _last_k(loss: SignalLoss) -> float:
-    """Return the end of the last bin with modes, at most 1.5 h/Mpc."""
-    filled = np.isfinite(loss.outside.transfer) | np.isfinite(loss.inside.transfer)
-    return min(float(loss.outside.bin_edges[1:][filled].max()), 1.5)
 
 
 def _limits(loss: SignalLoss) -> tuple[float, float]:

@@ -66,25 +66,18 @@ def draw_sweep(panels: Sequence[SweepPanel]) -> Figure:
     width = style.ONE_COLUMN if columns == 1 else style.TWO_COLUMNS
     figure = style.new_figure(width, 0.5 + PANEL_HEIGHT * rows)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    drawn = np.concatenate([item.transfer for panel in panels for item in panel.transfers])
     # Leave room for the flux scale above the points.
-    top = max(1.2, 1.15 * max(_highest(panel) for panel in panels))
+    limits = 1.1 * float(np.nanmin(drawn, initial=0.0)), max(1.2, 1.15 * float(np.nanmax(drawn, initial=0.0)))
     for axes, panel in zip(grid.flat, panels, strict=False):
         _draw_panel(axes, panel)
-        axes.set_ylim(min(0.0, 1.1 * min(_lowest(item) for item in panels)), top)
+        axes.set_ylim(limits)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     for axes in grid[:, 0]:
         axes.set_ylabel(TRANSFER)
     _add_legend(figure, grid.flat[0], edges, columns)
     return figure
-
-
-def _highest(panel: SweepPanel) -> float:
-    return max(float(np.nanmax(item.transfer, initial=0.0)) for item in panel.transfers)
-
-
-def _lowest(panel: SweepPanel) -> float:
-    return min(float(np.nanmin(item.transfer, initial=0.0)) for item in panel.transfers)
 
 
 def _draw_panel(axes: Axes, panel: SweepPanel) -> None:

@@ -65,6 +65,7 @@ def compare_visibilities(
     return VisibilityComparison(antennas, baseline_length, *spectra)
 
 
+@style.journal_style()
 def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -> Figure:
     """Draw real parts against frequency (left) and amplitudes of transforms against delay (right).
 
@@ -88,12 +89,6 @@ def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -
     name_baseline(delays, comparison.antennas, comparison.baseline_length)
     figure.legend(handles=delays.get_lines()[:4], loc="outside upper center", ncols=4)
     return figure
-
-
-@style.journal_style()
-def draw_model(comparison: VisibilityComparison) -> Figure:
-    """Draw true foregrounds F (the reference) and their fitted model F̂, both without gains."""
-    return draw_comparison(comparison, (r"true foregrounds $F$", r"fitted model $\widehat{F}$"))
 
 
 def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], float, Visibilities]:
@@ -135,13 +130,8 @@ class Model(InspectedFigure):
         gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
         shown = Visibilities(foregrounds, model / gains.scale**2, noise)
         comparison = compare_visibilities(pair, length, gains.frequency, shown)
-        return Drawing(draw_model(comparison), comparison)
-
-
-@style.journal_style()
-def draw_data(comparison: VisibilityComparison) -> Figure:
-    """Draw data V (the reference) and the model visibility ĝ_a ĝ_b* F̂, with the thermal noise of the data."""
-    return draw_comparison(comparison, (r"data $V$", r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$"))
+        labels = (r"true foregrounds $F$", r"fitted model $\widehat{F}$")
+        return Drawing(draw_comparison(comparison, labels), comparison)
 
 
 class Data(InspectedFigure):
@@ -173,7 +163,8 @@ class Data(InspectedFigure):
         corruption_factor, correction = (gains[0] * gains[1].conj() for gains in both)
         shown = Visibilities(data, correction * model, corruption_factor * noise)
         comparison = compare_visibilities(pair, length, fitted.frequency, shown)
-        return Drawing(draw_data(comparison), comparison)
+        labels = (r"data $V$", r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$")
+        return Drawing(draw_comparison(comparison, labels), comparison)
 
 
 @dataclass(frozen=True)

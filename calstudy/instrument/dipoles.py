@@ -67,10 +67,8 @@ class Tile:
         return tabulate(self._description, self.jones(frequencies), frequencies)
 
 
-@lru_cache(maxsize=1)
-def dipole_fields(path: Path | None, band: tuple[float, float], interpolation: str) -> DipoleFields:
-    """Return `DipoleFields`, which are slow to compute and take 0.5 GB, once for each process."""
-    return DipoleFields(path, band, interpolation)
+dipole_fields = lru_cache(maxsize=1)(DipoleFields)
+"""They are slow to compute and take 0.5 GB: once for each process."""
 
 
 def _single_fields(path: Path, low: float, high: float) -> Iterator[np.ndarray]:

@@ -12,16 +12,7 @@ from calstudy.calibrate.interface import PolynomialSmoothing
 from calstudy.calibrate.settings import GainFit
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import (
-    first_refusal,
-    k_of_delay,
-    other_calibrator,
-    other_faults,
-    other_sky_model,
-    other_weights,
-    require_long_baselines,
-    structured_gains,
-)
+from calstudy.claims.roles import k_of_delay, require_long_baselines, structured_gains, unsuitable
 from calstudy.corrupt.effects.gains import PerChannelGains, ReflectionGains
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
@@ -129,13 +120,12 @@ class Barry2016(Paper):
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return in words an unsuitable setting of an experiment for a role, or None."""
-        return first_refusal(
-            other_calibrator(experiment, ("sky-based", "skycal")),
+        return unsuitable(
+            experiment,
+            ("sky-based", "skycal"),
             _other_smoothing(experiment, smoothed=role in ("smooth_antennas", "structured_antennas")),
             _no_structure(experiment) if role == "structured_antennas" else structured_gains(experiment),
-            other_weights(experiment),
-            other_faults(experiment),
-            other_sky_model(experiment, incomplete=role != "complete_sky_model"),
+            incomplete=role != "complete_sky_model",
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import first_refusal, other_calibrator, other_faults, other_sky_model, other_weights
+from calstudy.claims.roles import unsuitable
 from calstudy.instrument.layouts import make_array, redundant_groups
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
@@ -74,14 +74,9 @@ class Byrne2019(Paper):
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return in words an unsuitable setting of an experiment for a role, or None."""
         steps = getattr(experiment.calibration, "steps", ())
-        return first_refusal(
-            other_calibrator(experiment, ("redcal",)),
-            None if "omnical" in steps else "calibration.steps has no omnical",
-            other_weights(experiment),
-            other_faults(experiment),
-            other_sky_model(experiment, incomplete=role == "redundant_incomplete"),
-            _no_lattice(experiment),
-        )
+        partial = None if "omnical" in steps else "calibration.steps has no omnical"
+        found = unsuitable(experiment, ("redcal",), partial, incomplete=role == "redundant_incomplete")
+        return found or _no_lattice(experiment)
 
 
 def _no_lattice(experiment: Experiment) -> str | None:

@@ -10,15 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias, ratio
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import (
-    first_refusal,
-    other_calibrator,
-    other_faults,
-    other_sky_model,
-    other_weights,
-    require_long_baselines,
-    require_same_world,
-)
+from calstudy.claims.roles import require_long_baselines, require_same_world, unsuitable
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement, Unevaluated
 
@@ -93,9 +85,4 @@ class Byrne2023(Paper):
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return in words an unsuitable setting of an experiment for a role, or None."""
         allowed = ("delay-weighted",) if role == "delay_weighted" else ("sky-based", "skycal")
-        return first_refusal(
-            other_calibrator(experiment, allowed),
-            other_weights(experiment),
-            other_faults(experiment),
-            other_sky_model(experiment, incomplete=True),
-        )
+        return unsuitable(experiment, allowed, incomplete=True)

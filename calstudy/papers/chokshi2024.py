@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import (
-    first_refusal,
-    other_calibrator,
-    other_faults,
-    other_sky_model,
-    other_weights,
-    require_long_baselines,
-)
+from calstudy.claims.roles import require_long_baselines, unsuitable
 from calstudy.experiment.assumed import assumed_changes, assumed_world
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 from calstudy.verdicts.statement import Source, Statement
@@ -86,14 +79,11 @@ class Chokshi2024(Paper):
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return in words an unsuitable setting of an experiment for a role, or None."""
         found = experiment.instrument.as_built.dipoles.amplitude_scatter
-        refusal = first_refusal(
-            other_calibrator(experiment, ("sky-based", "skycal")),
-            None if found >= LEAST else f"{AMPLITUDES} is {found:g}, not {LEAST:g} or more",
-            other_weights(experiment),
-            other_faults(experiment, SCATTER),
-        )
+        equal = None if found >= LEAST else f"{AMPLITUDES} is {found:g}, not {LEAST:g} or more"
+        incomplete = False if role == "one_beam" else None
+        refusal = unsuitable(experiment, ("sky-based", "skycal"), equal, incomplete=incomplete, fault=SCATTER)
         if refusal is not None or role == "one_beam":
-            return first_refusal(refusal, other_sky_model(experiment, incomplete=False))
+            return refusal
         others = [path for path in assumed_changes(experiment.calibration.assumed) if not path.startswith(DIPOLES)]
         if others:
             return f"calibration.assumed has {others[0]}"

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import (
-    first_refusal,
-    other_calibrator,
-    other_faults,
-    other_sky_model,
-    other_weights,
-    require_long_baselines,
-)
+from calstudy.claims.roles import require_long_baselines, unsuitable
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement
 
@@ -83,10 +76,5 @@ class Joseph2020(Paper):
             if TILES[0] <= dead <= TILES[1]
             else f"instrument.as_built.dipoles.dead_tiles is {dead:g}, not 0.15 to 0.4"
         )
-        return first_refusal(
-            other_calibrator(experiment, ("sky-based", "skycal")),
-            few,
-            other_weights(experiment),
-            other_faults(experiment, "dipoles.dead_tiles"),
-            other_sky_model(experiment, incomplete=False),
-        )
+        fault = "dipoles.dead_tiles"
+        return unsuitable(experiment, ("sky-based", "skycal"), few, incomplete=False, fault=fault)

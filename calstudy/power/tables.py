@@ -86,14 +86,10 @@ def _value(data: h5py.Dataset) -> Any:
     return data[()].item() if data.shape == () else data[()]
 
 
-def write_csv(path: Path, spectrum: SphericalSpectrum) -> None:
-    """Write a spherical spectrum as CSV, one row per bin of |k|, units in the header."""
-    write_columns(path, {name: values(spectrum) for name, values in CSV_COLUMNS.items()})
-
-
-def write_transfer_csv(path: Path, transfer: TransferFunction) -> None:
-    """Write a transfer function as CSV, one row per bin of |k|, units in the header."""
-    write_columns(path, {name: values(transfer) for name, values in TRANSFER_COLUMNS.items()})
+def write_csv(path: Path, spectrum: SphericalSpectrum | TransferFunction) -> None:
+    """Write a spherical spectrum or a transfer function as CSV, one row per bin of |k|, units in the header."""
+    columns = TRANSFER_COLUMNS if isinstance(spectrum, TransferFunction) else CSV_COLUMNS
+    write_columns(path, {name: values(spectrum) for name, values in columns.items()})
 
 
 def write_columns(path: Path, columns: Mapping[str, np.ndarray]) -> None:

@@ -18,7 +18,7 @@ from calstudy.power.gain_bias import FALLEN, ErrorCovariance, GainBias, bias_ter
 from calstudy.power.score import BANDS
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import of_common_units
-from calstudy.power.tables import load_spectrum, save_spectrum
+from calstudy.power.tables import save_spectrum
 from calstudy.products import spectra
 from calstudy.products.graph import Graph, memoize, required, size_of
 from calstudy.products.signal_loss import transfer
@@ -98,8 +98,3 @@ class ExpectGainBias(Task, stage="gain-bias", version=1):
     def _cost(self) -> Cost:
         held = 8 * size_of(self).baselines * self.channels.count * COMPLEX128
         return Cost(2 + 1e-8 * LENGTHS * held / COMPLEX128, LIBRARIES_MEMORY + held, 1e5)
-
-
-def read_gain_bias(folder: Path) -> GainBias:
-    """Read a product of the stage `gain-bias`."""
-    return load_spectrum(folder / GAIN_BIAS, GainBias)

@@ -18,7 +18,7 @@ from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.delay import make_taper
 from calstudy.power.spectra import SphericalSpectrum, of_common_units
-from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_transfer_csv
+from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_csv
 from calstudy.power.transfer import (
     BANDS,
     Injection,
@@ -45,7 +45,6 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
-from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.standing import marked, why_not_measured
 
@@ -105,17 +104,6 @@ def _flux_scale(graph: Graph) -> Task:
         odd=odd,
         gains=gains,
     )
-
-
-class TransferTable(StudyTable):
-    """The signal loss."""
-
-    of = "experiment"
-    place = 3
-
-    def products(self, graph: Graph) -> Sequence[Task | None]:
-        """Return the product."""
-        return [transfer(graph)]
 
 
 class Difference(Task, stage="difference", version=2):
@@ -178,11 +166,7 @@ class Transfer(Injected, stage="transfer", version=5, cost=Cost(1, disk=1e6)):
         known = read_json(self.scale / SCALE)["flux_scale"]
         scale = math.nan if known is None else known
         summary = write_transfer(output, self.read(), self.power, scale)
-        residual, signal = (
-            load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
-            for name in ("residual", "eor")
-        )
-        write_corrected(output, residual, signal)
+        write_corrected(output, *spectra.read_recovered(self.spectra))
         return {"transfer": summary, "flux_scale": _json(scale)}
 
 
@@ -202,7 +186,7 @@ def write_transfer(
             measured = spherical_transfer(injection, edges, buffer, inside, scale)
             found = where_measured(measured) if only_measured else measured
             save_spectrum(folder / spectrum_file(name, region), found)
-            write_transfer_csv(folder / f"{name}.{region}.csv", found)
+            write_csv(folder / f"{name}.{region}.csv", found)
         summary[region] = [
             {
                 "k": [low, high],

@@ -14,13 +14,12 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
 from calstudy.power.binned import cylindrical_average, noise_level, spherical_average, with_errors
 from calstudy.power.interface import estimate_spectra, polarizations_without_data
-from calstudy.power.spectra import DelaySpectra
+from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, DATA, RESIDUAL, read_visibilities, spectrum_file, write_visibilities
 from calstudy.products.graph import Graph, memoize, size_of
-from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
@@ -85,17 +84,6 @@ def spectra(graph: Graph) -> Task:
 def _reference(graph: Graph, component: Component) -> Task:
     """Return the spectra of one component alone, from which the errors of all variants that contain it come."""
     return variant_power(graph, component, Variant(components=(component,)))
-
-
-class SpectraTable(StudyTable):
-    """The power spectra of all variants."""
-
-    of = "experiment"
-    place = 1
-
-    def products(self, graph: Graph) -> Sequence[Task | None]:
-        """Return the product."""
-        return [spectra(graph)]
 
 
 class InBlocks(Task):
@@ -181,6 +169,12 @@ class Power(Task, stage="power", version=4):
 def read_delay_spectra(folder: Path) -> DelaySpectra:
     """Read a product of the stage `power`."""
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
+
+
+def read_recovered(folder: Path) -> list[SphericalSpectrum]:
+    """Read P^R and P^S outside the wedge from a product of the stage `spectra`."""
+    files = (folder / spectrum_file(name, "outside-wedge") for name in ("residual", "eor"))
+    return [load_spectrum(file, SphericalSpectrum) for file in files]
 
 
 class Spectra(Task, stage="spectra", version=4):

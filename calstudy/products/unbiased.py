@@ -14,8 +14,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.settings import PowerSettings
-from calstudy.power.spectra import SphericalSpectrum
-from calstudy.power.tables import load_spectrum, save_spectrum
+from calstudy.power.tables import save_spectrum
 from calstudy.power.windows import BinSignals, UnbiasedSpectrum, deconvolved, window_matrix
 from calstudy.products import corruption, signal_loss
 from calstudy.products.expected_loss import (
@@ -27,10 +26,10 @@ from calstudy.products.expected_loss import (
     solved_inputs,
     why_no_response,
 )
-from calstudy.products.files import read_arrays, read_json, spectrum_file
+from calstudy.products.files import read_arrays, read_json
 from calstudy.products.graph import Graph, memoize, required
 from calstudy.products.signal_loss import SCALE
-from calstudy.products.spectra import spectra
+from calstudy.products.spectra import read_recovered, spectra
 from calstudy.run.task import Input, Task
 
 UNBIASED = "unbiased.h5"
@@ -115,10 +114,7 @@ class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
         modes = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
         both = even["left"], odd["left"]
         window = window_matrix(modes, both, even["put_in"], edges, self.power.wedge_buffer)
-        residual, signal = (
-            load_spectrum(self.spectra / spectrum_file(name, "outside-wedge"), SphericalSpectrum)
-            for name in ("residual", "eor")
-        )
+        residual, signal = read_recovered(self.spectra)
         known = read_json(self.scale / SCALE)["flux_scale"]
         bins = slice(edges.size - 1)
         measured, error = (1 if known is None else known**2) * residual.power.real[bins], residual.error[bins]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, cores, total_memory
-from calstudy.calibrate.interface import Calibrator
-from calstudy.experiment.model import Experiment, Folders
+from calstudy.experiment.model import Experiment
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.simulation import SimulateChunk
@@ -27,22 +26,8 @@ ABSURD = 10
 """Data larger than this many times the memory are refused; a finished run of smaller ones may still be drawn."""
 
 
-class Contents(Protocol):
-    """The content of a file: an `Experiment`, or measured data, which have no section `simulation`."""
-
-    @property
-    def calibration(self) -> Calibrator:
-        """How gains are found."""
-
-    @property
-    def outputs(self) -> Folders:
-        """Store and folder of runs."""
-
-    def model_copy(self, *, update: Mapping[str, Any] | None = None) -> Self:
-        """Return a copy with other sections."""
-
-
-File = TypeVar("File", bound=Contents)
+File = TypeVar("File", bound=Any)
+"""The content of a file: an `Experiment`, or measured data, which have no section `simulation`."""
 
 
 def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -> tuple[File, int]:

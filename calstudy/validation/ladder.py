@@ -14,7 +14,7 @@ from rich.console import Console
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.package_files import published
 from calstudy.claims.paper import stand_ins, unique_notes
-from calstudy.experiment.files import StudyFile, checked, override, validate
+from calstudy.experiment.files import StudyFile, checked, overridden, validate
 from calstudy.experiment.model import Experiment, Outputs
 from calstudy.products.files import read_json
 from calstudy.run.execution import Budget
@@ -200,10 +200,7 @@ def _experiment(scale: str, overrides: Sequence[str], name: str, case: Case) -> 
     """Validate an experiment of a step; relative paths start at the folder of the published experiments."""
     path, changes = (case.file, case.overrides) if scale == "full" else (case.small_file, case.small)
     file = StudyFile.open(published("experiments") / path, None, overrides)
-    data = file.content
-    for dotted, value in changes.items():
-        data = override(data, dotted, value)
     try:
-        return validate(replace(file, content=data).changed(), file.folder)
+        return validate(replace(file, content=overridden(file.content, changes)).changed(), file.folder)
     except ExperimentError as error:
         raise ExperimentError([f"{name}: {sentence}" for sentence in error.faults]) from None

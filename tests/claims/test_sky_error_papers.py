@@ -8,9 +8,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tiny import load
 
 from calstudy.claims.bins import bias
-from calstudy.experiment.files import load, override, parse_override, validate
+from calstudy.experiment.files import override, parse_override, validate
 from calstudy.experiment.model import PAPERS
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.studies.load import load_study

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from tiny import load
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.files import (
     apply_scale,
     dump,
-    load,
     override,
     parse_override,
     parse_yaml,

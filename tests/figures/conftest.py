@@ -19,8 +19,7 @@ from calstudy.figures.visibilities import (
     VisibilityComparison,
     compare_visibilities,
     draw_baselines,
-    draw_data,
-    draw_model,
+    draw_comparison,
 )
 from calstudy.figures.wedge import TITLES, draw_wedge
 from calstudy.plotting import style
@@ -155,8 +154,7 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
                 {"one": (make_column(4), excised), "two": (excised, make_column(3, empty=1))}
             ),
             "gains": lambda: draw_gains(compare_gains((0, 1), FREQUENCY, *gains, gains[1])),
-            "model": lambda: draw_model(visibility_comparison),
-            "data": lambda: draw_data(visibility_comparison),
+            "visibilities": lambda: draw_comparison(visibility_comparison, ("data", "model")),
             "baselines": lambda: draw_baselines(baseline_spectra),
             "three baselines": lambda: draw_baselines(baseline_spectra[:3]),
             "baseline": lambda: draw_baselines(baseline_spectra[:1]),

@@ -12,14 +12,14 @@ import pytest
 import yaml
 from command_line import run_command
 from own_calibrators import KNOWN_GAINS, install, write_calibrator
-from tiny import tiny
+from tiny import load, tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.calibrators.given_gains import NoCalibration
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
-from calstudy.experiment.files import dump, load
+from calstudy.experiment.files import dump
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
 from calstudy.products.calibration import calibration

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import yaml
 from installed import install
-from tiny import tiny
+from tiny import load, tiny
 
 from calstudy.base.errors import InputError
-from calstudy.experiment.files import load
 from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from tiny import tiny
+from tiny import load, tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.user_code import load_file
@@ -20,7 +20,6 @@ from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.corrupt.interface import Effect
-from calstudy.experiment.files import load
 from calstudy.experiment.model import FIGURES
 from calstudy.instrument.settings import BEAMS, LAYOUTS, InstrumentSettings
 from calstudy.instrument.telescope import make_template

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny import load
 
 from calstudy.base.visibilities import from_cube
-from calstudy.experiment.files import load
 from calstudy.power.average import fringe_stop_and_average
 from calstudy.power.binned import spherical_average
 from calstudy.power.cosmology import input_power

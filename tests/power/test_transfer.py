@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from calstudy.power.delay import delay_transform, delays, make_taper
 from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
-from calstudy.power.tables import load_spectrum, save_spectrum, write_transfer_csv
+from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.power.transfer import (
     Injection,
     TransferFunction,
@@ -329,7 +329,7 @@ def test_tables_read_back(tmp_path, rng):
         save_spectrum(tmp_path / "t.h5", value)
         back = load_spectrum(tmp_path / "t.h5", kind)
         assert np.array_equal(back.transfer, value.transfer, equal_nan=True)
-    write_transfer_csv(tmp_path / "t.csv", found)
+    write_csv(tmp_path / "t.csv", found)
     rows = (tmp_path / "t.csv").read_text().splitlines()
     assert rows[0].startswith("k [h/Mpc],k from [h/Mpc],k to [h/Mpc],transfer,transfer error")
     assert len(rows) == 3

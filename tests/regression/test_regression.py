@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from tiny import of_the_paper
+from tiny import load, of_the_paper
 from typer.testing import CliRunner
 
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.cli.main import app
-from calstudy.experiment.files import load, override
+from calstudy.experiment.files import override
 from calstudy.regression import (
     Regression,
     accept,

@@ -12,12 +12,12 @@ import yaml
 from astropy.table import Table
 from pyuvdata import UVCal, UVData
 from rich.console import Console
-from tiny import tiny
+from tiny import load, tiny
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import from_cube, to_cube
 from calstudy.calibrate.sky_model import read_sky_model
-from calstudy.experiment.files import dump, load, override, validate
+from calstudy.experiment.files import dump, override, validate
 from calstudy.instrument.telescope import make_template
 from calstudy.products import calibration, simulation, sky_model
 from calstudy.products.graph import Graph

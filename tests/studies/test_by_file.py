@@ -14,6 +14,7 @@ from command_line import run_command
 from pyuvdata import UVCal, UVData
 from score_rows import row
 from small_chain import small
+from tiny import load
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
@@ -21,7 +22,6 @@ from calstudy.calibrate.calibrators.given_gains import MANIFEST, ByFile, find_re
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import assumed_world
-from calstudy.experiment.files import load
 from calstudy.instrument.telescope import make_template
 from calstudy.products import corruption
 from calstudy.products.graph import Graph

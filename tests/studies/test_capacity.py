@@ -4,11 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tiny import tiny
+from tiny import load, tiny
 
 from calstudy.base.errors import InputError
 from calstudy.base.resources import parse_memory
-from calstudy.experiment.files import load, override, validate
+from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Experiment
 from calstudy.products import corruption, simulation
 from calstudy.products.calibration import CalibrateChunk

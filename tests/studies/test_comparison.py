@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import yaml
 from small_chain import small
+from tiny import load
 
 import calstudy
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.assumed import assumed_changes
-from calstudy.experiment.files import load
 from calstudy.power.score import BANDS, Score
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction

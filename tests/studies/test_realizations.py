@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from tiny import tiny
+from tiny import load, tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.claims.evaluation import evaluate_folder
-from calstudy.experiment.files import dump, load, override, validate
+from calstudy.experiment.files import dump, override, validate
 from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import load_spectrum

@@ -82,9 +82,9 @@ def test_another_process_finds_the_same_keys(tmp_path):
     path = tmp_path / "tiny.yaml"
     path.write_text(yaml.safe_dump(tiny(tmp_path)))
     code = (
-        "import sys; from pathlib import Path; from calstudy.experiment.files import load; "
+        "import sys; from pathlib import Path; from calstudy.experiment.files import StudyFile; "
         "from calstudy.studies.kinds.experiment import ExperimentStudy; "
-        "print(*[task.key for task in ExperimentStudy(load(Path(sys.argv[1]))).tasks])"
+        "print(*[task.key for task in ExperimentStudy(StudyFile.open(Path(sys.argv[1])).experiment()).tasks])"
     )
     found = subprocess.run(
         [sys.executable, "-c", code, str(path)],

@@ -16,10 +16,10 @@ import yaml
 from fault_runs import differences
 from pyuvdata import UVCal, UVData
 from rich.console import Console
-from tiny import of_the_paper
+from tiny import load, of_the_paper
 
 from calstudy.base.errors import InputError
-from calstudy.experiment.files import load, override, validate
+from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Experiment
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum

@@ -9,10 +9,11 @@ import pytest
 import yaml
 from observations import small_instrument
 from small_chain import ANTENNAS, VARIANTS, small
+from tiny import load
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.gains import make_uvcal
-from calstudy.experiment.files import dump, load, override, validate
+from calstudy.experiment.files import dump, override, validate
 from calstudy.instrument.telescope import make_template
 from calstudy.power.tables import load_spectrum
 from calstudy.power.transfer import TransferFunction, TransferMap, pool

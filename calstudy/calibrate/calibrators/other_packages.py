@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -53,6 +53,13 @@ class Measured:
     def keys(self, rows: np.ndarray) -> list[tuple[int, int, str]]:
         """Return the keys of some baselines in hera_cal."""
         return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
+
+    def containers(self, rows: np.ndarray, *parts: np.ndarray) -> list[Any]:
+        """Return parts of some baselines, (len(rows), Nfreqs), as hera_cal has them: of a single time."""
+        from hera_cal.datacontainer import DataContainer
+
+        keys = self.keys(rows)
+        return [DataContainer({key: row[None] for key, row in zip(keys, part, strict=True)}) for part in parts]
 
 
 class Solved(NamedTuple):
@@ -262,13 +269,9 @@ class Skycal(OtherPackage):
         gains = np.ones((measured.frame.n_antennas, measured.frame.n_channels), complex)
         if not self.delays:
             return gains
-        from hera_cal.datacontainer import DataContainer
         from hera_cal.skycal import firstcal_gains, model_based_firstcal
 
-        keys = measured.keys(np.arange(len(ratio)))
-        containers = [
-            DataContainer({key: row[None] for key, row in zip(keys, rows, strict=True)}) for rows in (ratio, weight)
-        ]
+        containers = measured.containers(np.arange(len(ratio)), ratio, weight)
         delays, phases = model_based_firstcal(*containers, measured.frame.frequencies)
         for (antenna, _), gain in firstcal_gains(delays, phases, measured.frame.frequencies).items():
             gains[antenna] = gain[0]
@@ -278,13 +281,9 @@ class Skycal(OtherPackage):
         self, measured: Measured, rows: np.ndarray, ratio: np.ndarray, weight: np.ndarray, start: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return gains of some channels with the same baselines, and the steps of each, -1 where there are none."""
-        from hera_cal.datacontainer import DataContainer
         from hera_cal.skycal import refine_gains
 
-        keys = measured.keys(rows)
-        containers = [
-            DataContainer({key: row[None] for key, row in zip(keys, values, strict=True)}) for values in (ratio, weight)
-        ]
+        containers = measured.containers(rows, ratio, weight)
         first = {(antenna, FEED): gain[None] for antenna, gain in enumerate(start)}
         refined, details = refine_gains(
             *containers, first, refine_tol=self.tolerance, refine_maxiter=self.max_steps, max_divergent_chan_frac=1.0

@@ -11,20 +11,18 @@ from calstudy.claims.bins import (
     TINY,
     RecoveredPower,
     bias_extent,
-    bins_at_delays,
     difference_of_losses,
     difference_of_ratios,
     fraction_within,
     ratio,
     recovered,
+    reflection_bins,
     rms_power,
     used_bins,
 )
 from calstudy.claims.realizations import over_realizations
-from calstudy.corrupt.effects.gains import ReflectionGains
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
 from calstudy.papers.calamity2022.window import UNBIASED
-from calstudy.power.spectra import SphericalSpectrum
 from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
@@ -260,25 +258,14 @@ def redundant_modelling_loses_the_same(redundant: Results, modelling: Results) -
 
 LOW_SNR = Source("The Low Signal-to-Noise regime", ("low_snr",))
 REFLECTED = replace(LOW_SNR, tests_simulation=True)
-WIDTH = 2
-"""Half-width of the range of the reflection, in standard deviations of its delay."""
 TENFOLD = Within(10**0.5, 10**1.5)
 TENFOLD_WHY = "≈ 10, to half an order of magnitude"
-
-
-def reflection_bins(run: Results, spectrum: SphericalSpectrum) -> np.ndarray:
-    """Return the bins of k, (Nk,) bool, of the delays of the reflections; raises Unevaluated if there are none."""
-    gains = run.experiment.corruption.gains
-    if not isinstance(gains, ReflectionGains):
-        raise Unevaluated("the gains have no reflections")
-    low, high = (gains.delay + sign * WIDTH * gains.delay_scatter for sign in (-1, 1))
-    return bins_at_delays(spectrum, run.wedge("noise"), low, high)
 
 
 def _artefact(run: Results) -> float:
     """Return the ratio of the artefact to the noise in the average of all integrations."""
     spectrum = run.spherical("uncalibrated", "outside-wedge")
-    chosen = reflection_bins(run, spectrum)
+    chosen = reflection_bins(run, run.experiment, spectrum)
     return float(np.max(spectrum.power.real[chosen] / spectrum.noise_error[chosen]))
 
 
@@ -351,7 +338,7 @@ REMOVED = Sentence(
 )
 def artefact_removed(run: Results) -> Finding:
     spectrum = run.spherical("residual", "outside-wedge")
-    chosen = reflection_bins(run, spectrum)
+    chosen = reflection_bins(run, run.experiment, spectrum)
     error = spectrum.noise_error[chosen]
     return Finding(float(np.sum(spectrum.power.real[chosen] / error**2) / np.sqrt(np.sum(error**-2.0))), 1.0)
 

@@ -20,7 +20,7 @@ from calstudy.base.identity import identity
 from calstudy.base.schema import Section, fault
 from calstudy.claims.evaluation import combined_claims, members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
-from calstudy.experiment.files import StudyFile, apply_scale, checked, override, read_mapping, validate
+from calstudy.experiment.files import StudyFile, apply_scale, checked, overridden, read_mapping, validate
 from calstudy.experiment.model import Experiment, Figures, StudyName
 from calstudy.figures import StudyFigure, figure_task, figures_for
 from calstudy.results.reader import MANIFEST, RunFolder
@@ -245,9 +245,7 @@ def _load_member(member: Member, file: StudyFile) -> Experiment:
     data = read_mapping(path)
     if (kind := kind_of(data, path.parent)).model is not Experiment:
         raise InputError(f"has the key {kind.key or KINDS.tag!r}; members must be experiments")
-    data = apply_scale(data, file.scale)
-    for dotted, value in member.overrides.items():
-        data = override(data, dotted, value)
+    data = overridden(apply_scale(data, file.scale), member.overrides)
     if member.name:
         data["name"] = member.name
     changed = StudyFile(path, data, None, file.overrides)

@@ -26,6 +26,7 @@ from calstudy.experiment.files import (
     apply_scale,
     checked,
     dump,
+    overridden,
     override,
     parse_override,
     read_mapping,
@@ -229,9 +230,7 @@ class Comparison(Family):
         content = checked(ComparisonFile, data, file.folder)
         figures = figures_for("comparison", content.figures, "figures")
         overrides, worlds = _with_changes(content, changes)
-        base = _base(content, file, optional=own is not None)
-        for dotted, value in overrides.items():
-            base = override(base, dotted, value)
+        base = overridden(_base(content, file, optional=own is not None), overrides)
         salted = {"salt": content.salt} if content.salt else {}
         blocks = {
             label: {**block, **(salted if block.get(CALIBRATORS.tag) == "by-file" else {})}
@@ -534,8 +533,7 @@ def _make_cases(
     faults: dict[str, list[str]] = {}
     for (row, world), (column, calibrator) in itertools.product(enumerate(worlds), enumerate(calibrators)):
         data = {**base, "calibration": {**base.get("calibration", {}), **calibrators[calibrator]}}
-        for dotted, value in worlds[world].items():
-            data = override(data, dotted, value)
+        data = overridden(data, worlds[world])
         try:
             experiment = validate(data, folder)
             found = [] if experiment.measures_signal_loss else [VARIANTS_NEEDED]

@@ -100,24 +100,32 @@ class ExperimentStudy(Study):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        return tables_of("experiment", self.graph, self.experiment.outputs.tables)
+        calibrates = self.experiment.calibrates
+        found = [task for name, task in self._products.items() if calibrates or name != "sky_model"]
+        found += tables_of(self.graph, self.experiment.outputs.tables)
+        return list({task.key: task for task in found}.values())
 
     @cached_property
     def claims(self) -> Task | None:
         """The statements of the papers that the experiment names, or None."""
         return claims(self.evaluated, self.stand_ins)
 
-    @property
-    def evaluated(self) -> Evaluated:
-        """The experiment with the products on which statements of papers are evaluated."""
-        tables = {
+    @cached_property
+    def _products(self) -> dict[str, Task]:
+        """The products with the tables of every run, by the names by which statements of papers know them."""
+        found = {
             "spectra": spectra.spectra(self.graph),
             "agreement": agreement.agreement(self.graph),
             "transfer": signal_loss.transfer(self.graph),
             "score": score.score(self.graph),
             "sky_model": sky_model.error(self.graph),
         }
-        return Evaluated(self.experiment, {name: task for name, task in tables.items() if task is not None})
+        return {name: task for name, task in found.items() if task is not None}
+
+    @property
+    def evaluated(self) -> Evaluated:
+        """The experiment with the products on which statements of papers are evaluated."""
+        return Evaluated(self.experiment, self._products)
 
     @property
     def texts(self) -> dict[str, str]:
@@ -227,10 +235,10 @@ class Family(Study):
         )
 
 
-def content_of(experiment: Experiment) -> Any:
-    """Return the content that decides the run folder of an experiment."""
-    outputs = experiment.outputs.with_defaults("store", "runs")
-    return identity(experiment.model_copy(update={"outputs": outputs}).with_defaults("scales"))
+def content_of(file: Any) -> Any:
+    """Return the content that decides the run folder of an experiment, or of a file about measured data."""
+    outputs = file.outputs.with_defaults("store", "runs")
+    return identity(file.model_copy(update={"outputs": outputs}).with_defaults("scales"))
 
 
 def what_is_made(experiment: Experiment) -> Experiment:

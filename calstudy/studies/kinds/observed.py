@@ -8,7 +8,6 @@ from typing import Any, Self
 from pydantic import Field
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.identity import identity
 from calstudy.base.plugins import guarded
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Scales
@@ -16,12 +15,14 @@ from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.interface import require_antennas
 from calstudy.power.settings import PowerSettings
-from calstudy.products.table import tables_of
+from calstudy.products.observed_injection import expected_loss, transfer
+from calstudy.products.observed_results import observed_spectra, quality
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataFile, DataStudy, read_file, read_selected
+from calstudy.studies.kinds.experiment import content_of
 
 DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
@@ -83,8 +84,7 @@ class ObservedStudy(DataStudy):
     @property
     def content(self) -> Any:
         """The content of the file without scales and the folders of outputs."""
-        outputs = self.file.outputs.with_defaults("store", "runs")
-        return identity(self.file.model_copy(update={"outputs": outputs}).with_defaults("scales"))
+        return content_of(self.file)
 
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study fitted to a budget, and the number of workers; also refuse a beam that cannot be made."""
@@ -107,7 +107,9 @@ class ObservedStudy(DataStudy):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        return tables_of("observed", self.graph)
+        injected = [transfer(self.graph), expected_loss(self.graph)] if self.file.injection else []
+        found = [observed_spectra(self.graph), quality(self.graph), *injected]
+        return [task for task in found if task is not None]
 
 
 def _halves(file: ObservedFile) -> Parts:

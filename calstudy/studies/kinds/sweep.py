@@ -16,7 +16,7 @@ from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.claims.paper import stand_ins
-from calstudy.experiment.files import StudyFile, override, short_names, validate, with_absolute_paths
+from calstudy.experiment.files import StudyFile, overridden, short_names, validate, with_absolute_paths
 from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.products.graph import required
 from calstudy.products.signal_loss import SweepSummary, transfer
@@ -198,9 +198,7 @@ def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str
 
 def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str, folder: Path) -> Experiment:
     """Return the experiment of one point."""
-    data = dict(plain)
-    for path, value in changes.items():
-        data = override(data, path, value)
+    data = overridden(plain, changes)
     data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
     return validate(data, folder)
 

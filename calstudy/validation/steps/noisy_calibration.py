@@ -27,14 +27,12 @@ import numpy as np
 from pydantic import Field
 from pyuvdata import UVData
 
-from calstudy.base.errors import InputError
 from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.calibrate.agreement import ALLOWED, PARTS, pooled
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.records import CalibrationResult
-from calstudy.claims.bins import bins_at_delays, clustered_mean
-from calstudy.corrupt.effects.gains import ReflectionGains
+from calstudy.claims.bins import clustered_mean, reflection_bins
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, simulation, spectra
 from calstudy.products.corruption import PARITIES
@@ -197,8 +195,6 @@ class GainErrors(Step):
 
 
 NOISE_SIGMAS = 2
-WIDTH = 2
-"""Reflections are searched for within this many standard deviations of their mean delay."""
 
 
 SMALL = {
@@ -238,11 +234,7 @@ class LowSnr(Step):
         """Compare the spectra before and after calibration."""
         run = only(runs)
         corrupted, residual = (run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual"))
-        gains = run.experiment.corruption.gains
-        if not isinstance(gains, ReflectionGains):
-            raise InputError("the measurement needs an experiment with the effect reflection-gains")
-        low, high = (gains.delay + sign * WIDTH * gains.delay_scatter for sign in (-1, 1))
-        chosen = bins_at_delays(residual, run.wedge("noise"), low, high)
+        chosen = reflection_bins(run, run.experiment, residual)
         weights = residual.noise_error[chosen] ** -2.0
         artefact, left = (
             float(np.sum(weights * spectrum.power.real[chosen]) / weights.sum()) for spectrum in (corrupted, residual)
