@@ -120,7 +120,7 @@ class Registry(Kinds[P]):
     @property
     def wanted(self) -> str:
         """The names, or a file."""
-        return f"the name of {self.a_noun} ({', '.join(self.names()) or 'there are none'}) or a file.py"
+        return f"the name of {self.a_noun} ({', '.join(self.names())}) or a file.py"
 
     @property
     def base(self) -> type[P]:
@@ -190,9 +190,7 @@ class Registry(Kinds[P]):
             return self._checked(found, reference) if inspect.isclass(found) else self._in(found, reference)
         names = self.names()
         hint = nearest(reference, names)
-        raise InputError(
-            f"{reference!r} is not {self.a_noun}{hint} (there are: {', '.join(names) or 'none'}; or a file.py)"
-        )
+        raise InputError(f"{reference!r} is not {self.a_noun}{hint} (there are: {', '.join(names)}; or a file.py)")
 
     def reference_of(self, thing: type[P]) -> str:
         """Return the name or path by which `find` finds a class, or its bare name if it is in no file."""

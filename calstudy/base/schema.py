@@ -228,8 +228,7 @@ class KindField:
     def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """Return the JSON schema of the names, of the blocks of built-in kinds, and of references to files."""
         tag, union = self.kinds.tag, handler(core).get("anyOf", [])
-        names = self.kinds.names()
-        allowed = [*([{"enum": names}] if names else []), *self.kinds.others(), *union]
+        allowed = [{"enum": self.kinds.names()}, *self.kinds.others(), *union]
         # The type of a field with plug-ins has no blocks; a union has those with a tag.
         for name in filter(None, [self.default]) if union else self.kinds.built_in():
             block = handler.resolve_ref_schema(handler(self.kinds.find(name).__pydantic_core_schema__))

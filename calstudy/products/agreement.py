@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from calstudy.instrument.settings import Size
 from calstudy.products import calibration, corruption, simulation
 from calstudy.products.files import AGREEMENT, DATA, MODEL, RESIDUAL, VISIBILITIES, read_visibilities, write_json
 from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
 
 MOST_SAMPLES = 112 * 630 * 384
@@ -48,6 +49,17 @@ def agreement(graph: Graph) -> Task | None:
         gains=corruption.gains(graph),
         calibration=calibration.calibration(graph, residual, "even"),
     )
+
+
+class AgreementTable(StudyTable):
+    """How gains, model and residual agree with the truth."""
+
+    of = "experiment"
+    place = 2
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [agreement(graph)]
 
 
 class Agreement(Task, stage="agreement", version=3):

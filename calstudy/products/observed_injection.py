@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +47,7 @@ from calstudy.products.observed import average, calibrated, crosses_of, observed
 from calstudy.products.observed_results import observed_spectra
 from calstudy.products.signal_loss import Difference, Injected, write_corrected, write_transfer
 from calstudy.products.spectra import EXCISION, InBlocks, cross_power
+from calstudy.products.table import StudyTable
 from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Task, called
 from calstudy.simulate.interface import SimulationSize
@@ -140,6 +141,17 @@ def _of_data(graph: MeasuredGraph, part: str) -> dict[str, Any]:
         "sky_model": graph.experiment.observed.sky_model is not None,
         "probes": PROBES,
     }
+
+
+class ObservedLossTable(StudyTable):
+    """The signal loss and its prediction, if there is an injection."""
+
+    of = "observed"
+    place = 2
+
+    def products(self, graph: MeasuredGraph) -> Sequence[Task | None]:
+        """Return the products."""
+        return [transfer(graph), expected_loss(graph)] if graph.experiment.injection else []
 
 
 class SimulateEor(Task, stage="observed-eor", version=3):

@@ -23,6 +23,7 @@ from calstudy.products.files import DATA, read_json, read_visibilities, spectrum
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
 from calstudy.products.observed import SOURCES, WHAT, calibrated, noise_power, observed, power_of, read_observed
 from calstudy.products.spectra import EXCISION, read_delay_spectra
+from calstudy.products.table import StudyTable
 from calstudy.realdata.halves import PARITIES
 from calstudy.run.task import Input, Inputs, Task, called
 
@@ -70,6 +71,17 @@ def quality(graph: MeasuredGraph) -> Task:
         data={part: observed(graph, part) for part in graph.parts.facts},
         calibration={part: calibrated(graph, part) for part in graph.parts.facts},
     )
+
+
+class ObservedTable(StudyTable):
+    """The power spectra, and the quality of the calibration."""
+
+    of = "observed"
+    place = 1
+
+    def products(self, graph: MeasuredGraph) -> Sequence[Task | None]:
+        """Return the products."""
+        return [observed_spectra(graph), quality(graph)]
 
 
 class ObservedSpectra(Task, stage="observed-spectra", version=2, cost=Cost(10, disk=5e6)):

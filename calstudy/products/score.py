@@ -35,6 +35,7 @@ from calstudy.products.files import (
     write_json,
 )
 from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
 
 if TYPE_CHECKING:
@@ -69,6 +70,17 @@ def score(graph: Graph) -> MeasureScore | None:
         sky_model_error=sky_model.error(graph),
         linear_response=expected_loss.linear_response(graph),
     )
+
+
+class ScoreTable(StudyTable):
+    """The row of the calibrator in a comparison."""
+
+    of = "experiment"
+    place = 4
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [score(graph)]
 
 
 class MeasureScore(Task, stage="score", version=4):

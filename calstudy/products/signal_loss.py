@@ -45,6 +45,7 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.spectra import blocks_in
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.standing import marked, why_not_measured
 
@@ -104,6 +105,17 @@ def _flux_scale(graph: Graph) -> Task:
         odd=odd,
         gains=gains,
     )
+
+
+class TransferTable(StudyTable):
+    """The signal loss."""
+
+    of = "experiment"
+    place = 3
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [transfer(graph)]
 
 
 class Difference(Task, stage="difference", version=2):

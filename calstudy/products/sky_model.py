@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from calstudy.instrument.settings import InstrumentSettings
 from calstudy.products import simulation
 from calstudy.products.files import SKY_MODEL_ERROR, VISIBILITIES, read_visibilities, write_json, write_visibilities
 from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Task
 
 
@@ -93,6 +94,17 @@ def _text(value: Any) -> str:
         fields = ", ".join(f"{name} {_text(field)}" for name, field in value.items() if name != "kind")
         return f"{value['kind']} ({fields})" if fields else str(value["kind"])
     return value if isinstance(value, str) else json.dumps(value)
+
+
+class SkyModelTable(StudyTable):
+    """The error of the sky model, if anything is calibrated."""
+
+    of = "experiment"
+    place = 5
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [error(graph)] if graph.experiment.calibrates else []
 
 
 class ReadSkyModel(Task, stage="sky-model", version=1):

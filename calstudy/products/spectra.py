@@ -20,6 +20,7 @@ from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import AVERAGE, DATA, RESIDUAL, read_visibilities, spectrum_file, write_visibilities
 from calstudy.products.graph import Graph, memoize, size_of
+from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 
 if TYPE_CHECKING:
@@ -84,6 +85,17 @@ def spectra(graph: Graph) -> Task:
 def _reference(graph: Graph, component: Component) -> Task:
     """Return the spectra of one component alone, from which the errors of all variants that contain it come."""
     return variant_power(graph, component, Variant(components=(component,)))
+
+
+class SpectraTable(StudyTable):
+    """The power spectra of all variants."""
+
+    of = "experiment"
+    place = 1
+
+    def products(self, graph: Graph) -> Sequence[Task | None]:
+        """Return the product."""
+        return [spectra(graph)]
 
 
 class InBlocks(Task):

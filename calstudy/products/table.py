@@ -1,4 +1,4 @@
-"""Tables of a user's own."""
+"""Tables of a study: how it finds the products whose files are its tables, and tables of a user's own."""
 
 from __future__ import annotations
 
@@ -16,15 +16,22 @@ from calstudy.run.task import Inputs, Job, Task
 
 
 class StudyTable(Plugin):
-    """The base of the tables that are asked for in ``outputs.tables``. It has `inputs` and `rows`, or `products`.
+    """The base of all tables. A built-in one has `products`; one's own has `inputs` and `rows`.
 
     Attributes
     ----------
+    of
+        The kind of study that has the table, a module of `calstudy.studies.kinds`. A module of this package in which it
+        is written down has a table of every such study; others are asked for in ``outputs.tables``.
+    place
+        Among the tables of a study; those of a user's own come last.
     title, note
         Of the table in the report; the title is its name if empty.
     """
 
     registry: ClassVar = TABLES
+    of: ClassVar[str] = "experiment"
+    place: ClassVar[int] = 9
     title: ClassVar[str] = ""
     note: ClassVar[str] = ""
 
@@ -33,7 +40,7 @@ class StudyTable(Plugin):
     def refusal(self, experiment: Any) -> str | None:
         """Return why an experiment cannot have the table, to follow its name, or None."""
         del experiment
-        return None
+        return None if self.of == "experiment" else f"is of files of the kind {self.of!r}"
 
     def products(self, graph: Any) -> Sequence[Task | None]:
         """Return the products whose files are the table; None for one that the study does not have."""
@@ -92,12 +99,16 @@ def _cell(text: str) -> str:
     return text
 
 
-def tables_of(graph: Any, tables: Sequence[Plugin]) -> list[Task]:
-    """Return the products whose files are tables of a user's own; raises InputError for one that has none."""
-    found: list[Task] = []
-    for table in tables:
+def tables_of(kind: str, graph: Any, own: Sequence[Plugin] = ()) -> list[Task]:
+    """Return the products whose files are the tables of a study: those of its kind, and those that it asks for.
+
+    Raises InputError if it asks for one that it does not have.
+    """
+    built_in = sorted(TABLES.marked("of", (kind,)), key=lambda table: table.place)
+    found = [task for table in built_in for task in table().products(graph) if task is not None]
+    for table in own:
         asked = [task for task in cast(StudyTable, table).products(graph) if task is not None]
         if not asked:
             raise InputError(f"outputs.tables: asks for {table.label!r}, and there is no such product of this study")
         found += asked
-    return found
+    return list({task.key: task for task in found}.values())

@@ -24,15 +24,6 @@ class Empty(StudyTable):
         return []
 """
 
-SCORES = """
-from calstudy.products.score import score
-from calstudy.products.table import StudyTable
-
-class Scores(StudyTable):
-    def products(self, graph):
-        return [score(graph)]
-"""
-
 
 def study_of(folder, *tables, **changes):
     """Return the tiny experiment with these tables, without figures."""
@@ -79,7 +70,7 @@ def test_its_settings_and_its_code_are_in_its_key(folder):
     [
         (["as-built.py"], {}, "outputs.tables.0: 'as-built' cannot name a table"),
         ([NAME, NAME], {}, "outputs.tables.1: 'band_power' cannot name a table, or does so already"),
-        (["score"], {}, "outputs.tables.0: 'score' is not a table (there are: none; or a file.py)"),
+        (["observed-results"], {}, "asks for 'observed-results', which is of files of the kind 'observed'"),
         ([NAME], {"realizations": {"draw": ["eor"], "count": 2}}, "outputs.tables: are tables of single runs"),
     ],
 )
@@ -91,16 +82,9 @@ def test_what_cannot_be_had_is_told_when_the_file_is_read(tmp_path, tables, chan
 
 
 def test_a_product_that_a_study_lacks_is_no_table_of_it(tmp_path):
-    (tmp_path / "scores.py").write_text(SCORES)
-    study = study_of(tmp_path, "scores.py", variants={"eor": {"components": ["eor"]}})
-    with pytest.raises(InputError, match="asks for 'scores', and there is no such product"):
+    study = study_of(tmp_path, "score", variants={"eor": {"components": ["eor"]}})
+    with pytest.raises(InputError, match="asks for 'score', and there is no such product"):
         study.sized_to(Budget(workers=1))
-
-
-def test_a_table_of_every_run_that_is_asked_for_is_there_once(tmp_path):
-    (tmp_path / "scores.py").write_text(SCORES)
-    keys = [task.key for task in study_of(tmp_path, "scores.py").tables]
-    assert keys == [task.key for task in study_of(tmp_path).tables]
 
 
 def test_a_table_without_rows_is_refused(folder):

@@ -100,32 +100,24 @@ class ExperimentStudy(Study):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        calibrates = self.experiment.calibrates
-        found = [task for name, task in self._products.items() if calibrates or name != "sky_model"]
-        found += tables_of(self.graph, self.experiment.outputs.tables)
-        return list({task.key: task for task in found}.values())
+        return tables_of("experiment", self.graph, self.experiment.outputs.tables)
 
     @cached_property
     def claims(self) -> Task | None:
         """The statements of the papers that the experiment names, or None."""
         return claims(self.evaluated, self.stand_ins)
 
-    @cached_property
-    def _products(self) -> dict[str, Task]:
-        """The products with the tables of every run, by the names by which statements of papers know them."""
-        found = {
+    @property
+    def evaluated(self) -> Evaluated:
+        """The experiment with the products on which statements of papers are evaluated."""
+        tables = {
             "spectra": spectra.spectra(self.graph),
             "agreement": agreement.agreement(self.graph),
             "transfer": signal_loss.transfer(self.graph),
             "score": score.score(self.graph),
             "sky_model": sky_model.error(self.graph),
         }
-        return {name: task for name, task in found.items() if task is not None}
-
-    @property
-    def evaluated(self) -> Evaluated:
-        """The experiment with the products on which statements of papers are evaluated."""
-        return Evaluated(self.experiment, self._products)
+        return Evaluated(self.experiment, {name: task for name, task in tables.items() if task is not None})
 
     @property
     def texts(self) -> dict[str, str]:

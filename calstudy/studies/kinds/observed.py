@@ -15,8 +15,7 @@ from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
 from calstudy.power.interface import require_antennas
 from calstudy.power.settings import PowerSettings
-from calstudy.products.observed_injection import expected_loss, transfer
-from calstudy.products.observed_results import observed_spectra, quality
+from calstudy.products.table import tables_of
 from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
@@ -107,9 +106,7 @@ class ObservedStudy(DataStudy):
     @cached_property
     def tables(self) -> list[Task]:
         """The products whose files are the tables of a run."""
-        injected = [transfer(self.graph), expected_loss(self.graph)] if self.file.injection else []
-        found = [observed_spectra(self.graph), quality(self.graph), *injected]
-        return [task for task in found if task is not None]
+        return tables_of("observed", self.graph)
 
 
 def _halves(file: ObservedFile) -> Parts:
