@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,7 +60,9 @@ def test_thresholds_are_what_they_say(value, uncertainty, bound):
     finding = Finding(value, uncertainty)
     assert AtLeast(bound).holds(finding) == (value >= bound)
     assert AtMost(bound).holds(finding) == (value <= bound)
-    assert Within(bound, bound + 1).holds(finding) == (bound <= value <= bound + 1)
+    # Also where the uncertainty is not known.
+    for within in (finding, Finding(value, math.inf)):
+        assert Within(bound, bound + 1).holds(within) == (bound <= value <= bound + 1)
     assert AtLeast(bound, 2).holds(finding) <= AtLeast(bound).holds(finding)
     assert not (AtLeast(bound, 2).holds(finding) and AtMost(bound, 2).holds(finding))
     assert Equal(bound).holds(finding) == (abs(value - bound) <= 2 * uncertainty)
