@@ -32,7 +32,7 @@ from calstudy.products.files import (
 )
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
 from calstudy.products.spectra import InBlocks, blocks_in, cross_power
-from calstudy.realdata.halves import PARITIES, WHOLE, east_and_north, flag_channels, interleaved
+from calstudy.realdata.halves import PARITIES, WHOLE, east_and_north, flag_channels, half_of_sums, interleaved
 from calstudy.realdata.interference import flag_interference
 from calstudy.realdata.selection import Selection
 from calstudy.realdata.settings import Factor, FromAutocorrelations, ObservedSettings, Select
@@ -58,15 +58,16 @@ def observed(graph: MeasuredGraph, part: str) -> Observe:
     """
     section, parts, calibrator = graph.experiment.observed, graph.parts, graph.experiment.calibration
     halves = isinstance(section, ObservedSettings)
-    flux_scale = section.flux_scale if halves else None
+    flux_scale, differences = (section.flux_scale, section.difference) if halves else (None, ())
     size = parts.facts[part].size(len(parts.times(part)))
     autos = isinstance(calibrator, GainFit) and calibrator.autos
     return Observe(
         f"data {part}",
         files=list((section.odd if halves and part == "odd" else ()) or section.data),
+        difference=list(differences) or None,
         select=section.select,
         size={name: getattr(size, name) for name in size.__dataclass_fields__},
-        parity=part if parts.interleaved else None,
+        parity=part if parts.interleaved or differences else None,
         as_given=part == WHOLE,
         flag=list(section.flag) or None,
         interference=section.flag_interference,
@@ -133,6 +134,7 @@ class Observe(Task, stage="observe", version=4):
     select: Select
     size: Mapping[str, Any]
     parity: str | None
+    difference: Sequence[Path] | None = None
     as_given: bool = False
     flag: Sequence[str] | None = None
     interference: Any = None
@@ -173,6 +175,8 @@ class Observe(Task, stage="observe", version=4):
 
         selection, sky, placed = self.select.selection, None, []
         data = read_visibilities(self.files)
+        if self.difference is not None:
+            half_of_sums(data, read_visibilities(self.difference), str(self.parity))
         if self.positions is not None:
             placed = [place_antennas(data, self.positions)]
         data, changed = self._prepared(data, selection, self.flag or ())
@@ -186,7 +190,7 @@ class Observe(Task, stage="observe", version=4):
                 raise InputError(f"sky model: is in {sky.vis_units!r}, and must be in Jy; convert it first")
             sky, data, left_out = common_baselines(sky, data, bool(self.autos))
             notes += [f"Sky model: {note}" for note in sky_notes] + left_out
-        if self.parity is not None:
+        if self.parity is not None and self.difference is None:
             data, sky = (uvd and interleaved(uvd, self.parity) for uvd in (data, sky))
         return data, sky, notes
 

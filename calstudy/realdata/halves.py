@@ -255,6 +255,17 @@ def require_same_sky(even: Facts, odd: Facts, sky_model: Path | None = None) -> 
     )
 
 
+def require_same_samples(data: Facts, difference: Facts) -> None:
+    """Raise InputError unless differences of a correlator are of the samples of its sums."""
+    pairs = [facts.frame.pairs.tolist() for facts in (data, difference)]
+    names = ("frequencies", "times", "polarizations")
+    if pairs[0] != pairs[1] or any(not np.array_equal(getattr(data, x), getattr(difference, x)) for x in names):
+        raise InputError(
+            "observed.difference: its baselines, times, channels or polarizations are not those of observed.data; give "
+            "the file of differences that was written with these sums"
+        )
+
+
 def _require_same_baselines(even: Frame, odd: Frame) -> None:
     found = [{(a, b) for a, b in frame.pairs[~frame.autos].tolist()} for frame in (even, odd)]
     if found[0] == found[1]:
@@ -278,6 +289,20 @@ def interleaved(data: UVData, parity: str) -> UVData:
     times = np.arange(PARITIES.index(parity), data.Ntimes, 2)
     rows = (times[:, None] * data.Nbls + np.arange(data.Nbls)).ravel()
     return data.select(blt_inds=rows, inplace=False, run_check=False)
+
+
+def half_of_sums(sums: UVData, differences: UVData, parity: str) -> None:
+    """Turn sums of a correlator's two samples into one of these, (sum + difference) / 2 or (sum - difference) / 2.
+
+    Raise InputError if both are not of the same samples in the same order. Samples flagged in either are flagged.
+    """
+    same = (np.array_equal(getattr(sums, x), getattr(differences, x)) for x in ("baseline_array", "time_array"))
+    if sums.data_array.shape != differences.data_array.shape or not all(same):
+        raise InputError("observed.difference: is not of the samples of observed.data, in the same order")
+    sign = 1 if parity == PARITIES[0] else -1
+    sums.data_array = (sums.data_array + sign * differences.data_array) / 2
+    sums.flag_array = sums.flag_array | differences.flag_array
+    sums.integration_time = sums.integration_time / 2
 
 
 def flag_channels(data: UVData, text: str) -> None:

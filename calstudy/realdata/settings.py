@@ -190,6 +190,11 @@ class ObservedSettings(DataSettings):
         description="Other data of the same sky, such as another night at the same sidereal time: spectra are data x "
         "odd. Empty: every second integration of `data`.",
     )
+    difference: DataFiles = Field(
+        (),
+        description="Differences of two samples, of a correlator whose sums are `data`, such as HERA's files .diff "
+        "beside .sum: the halves are (data + difference) / 2 and (data - difference) / 2, of half the time.",
+    )
     beam: Annotated[SerializeAsAny[Plugin], BEAMS.field()] = Field(
         description="The beam of the antennas; it normalizes power spectra, and the injected signal is seen through it."
     )
@@ -203,6 +208,8 @@ class ObservedSettings(DataSettings):
     def _sky_model_is_of_one_data_set(self) -> ObservedSettings:
         if self.odd and self.sky_model is not None:
             raise fault("sky_model", "cannot have the times of both data and odd; leave out one of sky_model and odd")
+        if self.odd and self.difference:
+            raise fault("difference", "gives the halves, as odd does; leave out one of difference and odd")
         return self
 
 

@@ -17,6 +17,7 @@ from calstudy.products.files import DATA
 from calstudy.products.observed import observed
 from calstudy.realdata import reading
 from calstudy.realdata.halves import PARITIES
+from calstudy.realdata.noise import radiometer_variance
 from calstudy.studies.kinds.observed import ObservedStudy
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget
@@ -212,3 +213,41 @@ def test_a_sky_model_of_other_antennas_is_refused(tmp_path):
     found = study(tmp_path, {"data": "data.uvh5", "sky_model": "sky.uvh5"})
     with pytest.raises(InputError, match=r"observed.sky_model: .* has none of the cross-correlations of the data"):
         found.sized_to(Budget(workers=1))
+
+
+def test_sums_and_differences_of_a_correlator_give_back_its_two_samples(tmp_path):
+    samples = {parity: measurement() for parity in PARITIES}
+    samples["odd"].data_array *= 1j
+    samples["odd"].flag_array[5] = True
+    sums, differences = samples["even"].copy(), samples["even"].copy()
+    for made, sign in ((sums, 1), (differences, -1)):
+        made.data_array = samples["even"].data_array + sign * samples["odd"].data_array
+    differences.flag_array = samples["odd"].flag_array
+    for made, name in ((sums, "sum.uvh5"), (differences, "diff.uvh5")):
+        made.write_uvh5(tmp_path / name)
+    graph = study(tmp_path, {"data": "sum.uvh5", "difference": "diff.uvh5"}).graph
+    for parity, sample in samples.items():
+        found, _, _ = observed(graph, parity).read()
+        assert np.allclose(to_cube(found), to_cube(sample))
+        assert np.allclose(found.integration_time, sample.integration_time / 2)
+        assert found.flag_array.sum() == samples["odd"].flag_array.sum()
+    later = differences.select(times=np.unique(differences.time_array)[1:], inplace=False)
+    later.write_uvh5(tmp_path / "later.uvh5")
+    with pytest.raises(InputError, match=r"observed\.difference: its baselines, times"):
+        study(tmp_path, {"data": "sum.uvh5", "difference": "later.uvh5"})
+    with pytest.raises(ExperimentError, match="leave out one of difference and odd"):
+        study(tmp_path, {"data": "sum.uvh5", "difference": "diff.uvh5", "odd": "diff.uvh5"})
+
+
+def test_the_two_samples_of_hera_differ_by_the_noise_of_their_autocorrelations(tmp_path):
+    name = "hera_qm:data/zen.2459122.49827.{}.downselected.uvh5"
+    quiet = {"frequencies": "159 MHz..187 MHz", "polarizations": "ee", "lengths": "5 m..75 m"}
+    section = {"data": name.format("sum"), "difference": name.format("diff"), "select": quiet}
+    section["flux_scale"] = {"kind": "factor", "unit": "1 Jy"}
+    even, odd = (observed(study(tmp_path, section).graph, parity).read()[0] for parity in PARITIES)
+    pairs = antenna_pairs(even)
+    crosses = pairs[:, 0] != pairs[:, 1]
+    variance = sum(radiometer_variance(uvd, pairs[crosses], 0) for uvd in (even, odd))
+    power = np.abs(to_cube(even) - to_cube(odd))[..., 0][:, crosses] ** 2 / variance
+    # A mean of 6072 squares scatters by 0.013; of the whole integration time, or of sums, it would be 2 or more.
+    assert np.mean(power) == pytest.approx(1, abs=0.08)

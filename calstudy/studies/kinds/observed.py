@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -16,7 +17,7 @@ from calstudy.instrument.interface import model_of
 from calstudy.power.interface import require_antennas
 from calstudy.power.settings import PowerSettings
 from calstudy.products.table import tables_of
-from calstudy.realdata.halves import PARITIES, Parts, require_same_sky
+from calstudy.realdata.halves import PARITIES, Parts, require_same_samples, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
@@ -74,7 +75,7 @@ class ObservedStudy(DataStudy):
                 f"{facts.antennas} antennas, baselines to {facts.size(1).longest:.3g} m, beam {section.beam.label}",
                 facts.channels.label,
                 f"{facts.times.size} integrations of {facts.integration:.3g} s"
-                + (" in each half" if section.odd else ""),
+                + (" in each half" if section.odd or section.difference else ""),
                 "no EoR injected" if injection is None else f"EoR injected{level}",
                 self.file.calibration.label,
             )
@@ -118,10 +119,14 @@ def _halves(file: ObservedFile) -> Parts:
         require_antennas(file.power, facts.frame.numbers, "leave them out by observed.select.antennas")
     if section.odd:
         require_same_sky(even, odd, section.sky_model)
+    elif section.difference:
+        require_same_samples(even, read_selected(file, section.difference))
+        # Of the same metadata, and not interleaved.
+        odd = replace(even)
     elif even.times.size < 2:
         raise InputError(
             f"observed.data: {even.times.size} integration; two are needed, for even and odd, or other data of the "
-            "same sky as observed.odd"
+            "same sky as observed.odd, or what the correlator writes of differences as observed.difference"
         )
     if even.unit.lower() != "jy" and section.flux_scale is None and section.sky_model is None:
         raise InputError(
