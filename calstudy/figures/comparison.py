@@ -120,7 +120,7 @@ class ComparisonSpectra(CasesFigure):
 
 LINEAR_BIAS = 0.01
 """Upper end of the linear part of the axis of the bias."""
-LABEL_WIDTH = 9
+LABEL_WIDTH = 10
 
 
 @style.journal_style()
@@ -147,7 +147,7 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
         upper.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
         lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
         lower.set_yscale("symlog", linthresh=LINEAR_BIAS)
-        names = [textwrap.fill(name, LABEL_WIDTH) for name in calibrators]
+        names = [textwrap.fill(name, LABEL_WIDTH, break_long_words=False) for name in calibrators]
         lower.set_xticks(range(len(calibrators)), names, fontsize=style.SMALL_SIZE, rotation=90)
     grid[0, 0].set_ylabel(r"$T$, free of the flux scale")
     grid[1, 0].set_ylabel(r"bias $s^2 P^{R_0} / P^S$")
