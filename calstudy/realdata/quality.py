@@ -34,6 +34,12 @@ GAIN_FACTOR = 5.0
 # Means of pure noise over many samples scatter by a few per cent.
 CHI2_FACTOR = 3.0
 INTERFERENCE = "interference? (--flag-interference, observed.flag_interference: true)"
+BRIGHT = 2.0
+"""Data of a channel over those of the others from which on they tell interference; gains may be high by noise alone."""
+NOISE = (
+    "the data are not: noise? (solve more integrations together, integrations_per_solve, or smooth the gains, "
+    "smooth_gains)"
+)
 NAMED = 6
 """Largest number of channels or antennas named in a warning; solution.json has all of them."""
 # Median over mean of the square of a complex normal variable.
@@ -51,6 +57,7 @@ class Quality:
     antennas, frequency : names of the antennas with solutions, (Nants,), and channels in Hz, (Nfreqs,)
     gain_by_channel : |g| over the antenna's median, median over integrations, (Nants, Nfreqs)
     gain_by_antenna : median |g| of each antenna over the median of all antennas, (Nants,)
+    data_by_channel : |V| over that of the median channel, median over baselines and integrations, (Nfreqs,)
     chi2_by_antenna, chi2_by_channel, chi2_by_integration
         Mean of |V - g g* F|^2 / sigma^2 over unflagged samples, (Nants,), (Nfreqs,), (Ntimes,). Parameters of the fit
         are not counted, so that it is slightly below one for noise.
@@ -62,6 +69,7 @@ class Quality:
     frequency: np.ndarray
     gain_by_channel: np.ndarray
     gain_by_antenna: np.ndarray
+    data_by_channel: np.ndarray
     chi2_by_antenna: np.ndarray
     chi2_by_channel: np.ndarray
     chi2_by_integration: np.ndarray
@@ -75,8 +83,10 @@ class Quality:
         integrations = [f"integration {index}" for index in range(self.chi2_by_integration.size)]
         antennas = [f"antenna {name}" for name in self.antennas]
         inverse = 1 / np.where(self.gain_by_antenna > 0, self.gain_by_antenna, np.nan)
+        loud, quiet = (np.where((self.data_by_channel > BRIGHT) == bright, highest, np.nan) for bright in (True, False))
         found = [
-            _sentence("|g| is far above the antenna's median", "x", channels, highest, GAIN_FACTOR, INTERFERENCE),
+            _sentence("|g| is far above the antenna's median", "x", channels, loud, GAIN_FACTOR, INTERFERENCE),
+            _sentence("|g| is far above the antenna's median", "x", channels, quiet, GAIN_FACTOR, NOISE),
             _sentence("|g| is far above that of the other antennas", "x", antennas, self.gain_by_antenna, GAIN_FACTOR),
             _sentence(
                 "|g| is far below that of the other antennas", "1/", antennas, inverse, GAIN_FACTOR, "a dead one?"
@@ -144,6 +154,8 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     products = gain_products(gains, pairs)[0][..., polarization]
     unused = flag_cube(result.residual)[..., polarization]
     power = np.abs(np.where(unused, np.nan, to_cube(result.residual)[..., polarization] * products)) ** 2
+    measured = np.where(unused, np.nan, np.abs(to_cube(data)[..., polarization][:, rows_of(data, pairs)]))
+    brightness = np.ma.median(np.ma.masked_invalid(measured), axis=(0, 1)).filled(np.nan)
     variance = radiometer_variance(data, pairs, polarization)
     noise = "autocorrelations, by the radiometer equation"
     if variance is None:
@@ -160,6 +172,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
         frequency=np.asarray(result.model.freq_array, float),
         gain_by_channel=by_channel,
         gain_by_antenna=by_antenna,
+        data_by_channel=brightness / _median(brightness),
         chi2_by_antenna=np.array([_mean(chi2[:, chosen], ()) for chosen in touching]).ravel(),
         chi2_by_channel=_mean(chi2, (2,)),
         chi2_by_integration=_mean(chi2, (0,)),

@@ -96,10 +96,13 @@ def test_gains_that_stand_out_are_named(clean):
     gains = np.ones((8, clean.Nfreqs, N_TIMES, 1), complex)
     gains[:, CHANNEL] = 80j
     gains[ANTENNA] *= 0.1
-    told = assess(clean, result_of(clean, normal(clean), gains)).warnings
-    assert len(told) == 2
-    assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); interference?" in told[0]
-    assert f"antenna ant{clean.telescope.antenna_numbers[ANTENNA]} (1/10); a dead one?" in told[1]
+    loud = clean.copy()
+    loud.data_array[:, CHANNEL] *= 50
+    for data, question in ((loud, "interference?"), (clean, "the data are not: noise?")):
+        told = assess(data, result_of(data, normal(data), gains)).warnings
+        assert len(told) == 2
+        assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); {question}" in told[0]
+        assert f"antenna ant{clean.telescope.antenna_numbers[ANTENNA]} (1/10); a dead one?" in told[1]
 
 
 def with_autos(data: UVData, power: float) -> UVData:
