@@ -1,4 +1,4 @@
-"""The picture of effects in docs/effects.md: what each does to foregrounds in delay, and that it does so where it should.
+"""The picture of effects in docs/effects.md: what each does to foregrounds in delay, and where.
 
 `python tests/docs/test_effects_picture.py` draws the picture again.
 """
@@ -54,7 +54,7 @@ CONTENT: dict[str, Any] = {
 
 
 class Powers(NamedTuple):
-    """Mean powers of the baselines at delays in ns, ascending: by effect, of foregrounds without one, and of the EoR."""
+    """Mean powers of baselines at delays in ns: by effect, of foregrounds without one, and of the EoR."""
 
     delay: np.ndarray
     by_effect: dict[str, np.ndarray]
