@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
+import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import Field, SerializeAsAny, model_validator
 from rich.console import Console
@@ -19,7 +20,7 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
-from calstudy.base.gains import gain_products
+from calstudy.base.gains import gain_products, gains_for
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
@@ -253,6 +254,11 @@ class DataCalibration(DataStudy):
             if self.start is not None:
                 gains = read_gains(self.start, "calibration.initial_gains.path", data)
                 starting_gains(observation.baselines(fitted), gains)
+                unknown = ~np.isfinite(gains_for(gains, data)).any(axis=(1, 2, 3))
+                if unknown.any():
+                    doubts.append(
+                        f"The gains of {unknown.sum()} of {unknown.size} antennas are flagged; these start from unity."
+                    )
         return [*notes, *doubts]
 
     @property
