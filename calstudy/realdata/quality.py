@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 GAIN_FACTOR = 5.0
 # Means of pure noise over many samples scatter by a few per cent.
 CHI2_FACTOR = 3.0
-INTERFERENCE = "interference? (--flag-interference, observed.flag_interference: true)"
+INTERFERENCE = (
+    "interference? (--flag-interference, observed.flag_interference: true; if it is on, select a quieter band)"
+)
 NAMED = 6
 """Largest number of channels or antennas named in a warning; solution.json has all of them."""
 # Median over mean of the square of a complex normal variable.

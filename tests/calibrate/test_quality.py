@@ -99,6 +99,7 @@ def test_gains_that_stand_out_are_named(clean):
     told = assess(clean, result_of(clean, normal(clean), gains)).warnings
     assert len(told) == 2
     assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); interference?" in told[0]
+    assert "if it is on, select a quieter band" in told[0]
     assert f"antenna ant{clean.telescope.antenna_numbers[ANTENNA]} (1/10); a dead one?" in told[1]
 
 
