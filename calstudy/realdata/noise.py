@@ -29,6 +29,8 @@ from calstudy.power.spectra import DelaySpectra, outside_wedge
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+# Median over mean of the square of a complex normal variable.
+MEDIAN_OVER_MEAN = np.log(2)
 ABOVE_NOISE = 2.0
 """Antennas with a baseline of more than so many times the median power of noise correlate with another."""
 
@@ -85,13 +87,13 @@ def uncorrelated(data: UVData) -> list[int]:
     pairs = antenna_pairs(data)
     crosses = np.not_equal(*pairs.T)
     pairs, values = pairs[crosses], np.abs(np.where(flag_cube(data), 0, to_cube(data))[:, crosses]) ** 2
-    seen = (values > 0).any(axis=(0, 2))
+    seen = np.asarray(np.any(values > 0, axis=(0, 2)))
     for polarization in range(data.Npols):
         variance = radiometer_variance(data, pairs, polarization)
         if variance is not None:
             ratios = np.ma.masked_invalid(np.where(values[..., polarization] > 0, values[..., polarization], np.nan))
             medians = np.ma.median(ratios / np.ma.masked_invalid(variance), axis=(0, 2)).filled(np.inf)
-            seen[:, polarization] &= medians > ABOVE_NOISE * np.log(2)
+            seen[:, polarization] &= medians > ABOVE_NOISE * MEDIAN_OVER_MEAN
     numbers = np.unique(pairs)
     lost = np.setdiff1d(numbers, pairs[seen.any(axis=1)])
     return lost.tolist() if 2 * lost.size < numbers.size else []

@@ -24,7 +24,7 @@ from calstudy.base.visibilities import (
 )
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import ForegroundFit, GainFit
-from calstudy.realdata.noise import radiometer_variance
+from calstudy.realdata.noise import MEDIAN_OVER_MEAN, radiometer_variance
 
 if TYPE_CHECKING:
     from calstudy.calibrate.problem import CalibrationProblem
@@ -38,8 +38,6 @@ INTERFERENCE = (
 )
 NAMED = 6
 """Largest number of channels or antennas named in a warning; solution.json has all of them."""
-# Median over mean of the square of a complex normal variable.
-MEDIAN_OVER_MEAN = np.log(2)
 NEIGHBOURS = 1.5
 """Largest distance of compared integrations, in integration times."""
 
