@@ -316,13 +316,33 @@ def test_no_file_is_written_about_one_integration(here, capsys):
     assert not (here / "mine.yaml").exists()
 
 
-def test_a_file_about_measured_data_is_valid_and_names_their_band(here, capsys, schema):
+def test_a_file_about_measured_data_is_valid_and_proposes_what_is_quiet_and_alive(here, capsys, schema):
     package = "hera_qm:data/zen.2457698.40355.xx.HH.uvh5"
     output_of(capsys, "init", "mine", "--data", package)
-    content = parse_yaml((here / "mine.yaml").read_text(), "mine")
+    text = (here / "mine.yaml").read_text()
+    content = parse_yaml(text, "mine")
     assert [error.message for error in schema.iter_errors(content)] == []
-    assert content["observed"]["select"]["frequencies"] == "137.500 MHz..162.403 MHz"
+    # There is interference at 149.902 and 157.812 MHz, and antenna 81 saw no sky.
+    assert content["observed"]["select"]["frequencies"] == "137.597 MHz..149.805 MHz"
+    assert "81" not in content["observed"]["select"]["antennas"].split(",")
+    for told in ("80 of 171 with a redundant partner", "do not stand out from others; all: 137.500 MHz..162.403 MHz"):
+        assert told in text
     # The file has autocorrelations; weights of gains that are lost in noise would run away.
     assert content["calibration"]["weights"] == "autos"
-    study = load_study(here / "mine.yaml")
-    assert study.graph.parts.facts["even"].frequencies.size == 256
+    facts = load_study(here / "mine.yaml").graph.parts.facts["even"]
+    assert (facts.frequencies.size, facts.antennas) == (126, 18)
+
+
+def test_all_channels_and_antennas_are_proposed_where_none_stands_out_or_data_are_large(here, capsys, monkeypatch):
+    import hera_qm
+
+    data = UVData.from_file(Path(hera_qm.__file__).parent / "data" / "zen.2457698.40355.xx.HH.uvh5")
+    data.select(freq_chans=range(20, 60), antenna_nums=[9, 10, 20, 22])
+    data.write_uvh5("quiet.uvh5")
+    for reason in ("All channels: leave out edges", "All channels; data so large were not searched"):
+        output_of(capsys, "init", "mine", "--data", "quiet.uvh5")
+        text = (here / "mine.yaml").read_text()
+        assert reason in text
+        assert parse_yaml(text, "mine")["observed"]["select"] == {"frequencies": "139.453 MHz..143.262 MHz"}
+        (here / "mine.yaml").unlink()
+        monkeypatch.setattr("calstudy.cli.start.LARGE", 1.0)

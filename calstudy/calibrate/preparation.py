@@ -207,13 +207,17 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
     """Return the gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols); unity if `gains` is None.
 
     Of several integrations the closest in time is used; flagged, zero and infinite gains are replaced by unity. Raises
-    InputError if an antenna, channel or polarization of the data has no gain, or if the gains are delays.
+    InputError if an antenna, channel or polarization of the data has no gain, if all are replaced, or if the gains are
+    delays.
     """
     if gains is None:
         return np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
     closest = np.abs(solution_times(gains)[None] - data.times[:, None]).argmin(axis=1)
     values = gains_for(gains, data.uvd)[:, :, closest]
-    return np.where(np.isfinite(values) & (values != 0), values, 1)
+    known = np.isfinite(values) & (values != 0)
+    if not known.any():
+        raise InputError("gains: all are flagged, zero or not finite; take others, or none to start from unity")
+    return np.where(known, values, 1)
 
 
 def redundant_start(

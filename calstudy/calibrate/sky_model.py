@@ -63,7 +63,8 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
     Cross-correlations that the sky model lacks are left out of the data. Autocorrelations that it lacks stay, with a
     sky model of zero, unless they are fitted (`autos`): weights may need them. The inputs are from
     `calstudy.realdata.reading.prepare`, and not changed; the returned sky model has the samples of the returned data,
-    in their order. Raises InputError if no cross-correlation is in both, or as `match_sky_model`.
+    in their order. Raises InputError if no cross-correlation is in both, all are zero or flagged in the
+    sky model, or as `match_sky_model`.
     """
     known = {frozenset(pair) for pair in zip(sky.ant_1_array.tolist(), sky.ant_2_array.tolist(), strict=True)}
     pairs = list(zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True))
@@ -77,9 +78,12 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
         notes.append(f"{len(lost)} baselines that the sky model lacks are left out, such as {lost[0]}.")
         data = data.select(blt_inds=np.flatnonzero(kept), inplace=False)
         modelled = modelled[kept]
-    if modelled.all():
-        return match_sky_model(sky, data), data, notes
-    part = match_sky_model(sky, data.select(blt_inds=np.flatnonzero(modelled), inplace=False))
+    whole = modelled.all()
+    part = match_sky_model(sky, data if whole else data.select(blt_inds=np.flatnonzero(modelled), inplace=False))
+    if not (~part.flag_array & (part.data_array != 0))[part.ant_1_array != part.ant_2_array].any():
+        raise InputError("sky model: where the data are, all of it is zero or flagged; it must be visibilities")
+    if whole:
+        return part, data, notes
     filled = from_cube(data, np.zeros((data.Ntimes, data.Nbls, data.Nfreqs, data.Npols), complex))
     filled.data_array[modelled] = part.data_array
     return filled, data, notes

@@ -10,19 +10,25 @@ import math
 import re
 from pathlib import Path
 from string import Template
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.cli.options import named_as_options
 
+if TYPE_CHECKING:
+    from calstudy.realdata.halves import Facts
+
 MODELINE = "# yaml-language-server: $schema="
 """Start of the line from which editors know the schema of a file."""
 PLAIN_PATH = re.compile(r"[A-Za-z./][\w./-]*\.[A-Za-z]\w*")
 """Paths that YAML reads as they are, without quotes."""
 SCALE = "flux_scale: {kind: system-temperature, receiver: 100 K}   # or {kind: factor, unit: 1 Jy}"
+LARGE = 5e6
+"""Most samples that are searched for interference, which takes about a minute."""
 
 Name = Annotated[str, typer.Argument(help="Of the experiment; the file is NAME.yaml.")]
 Example = Annotated[str | None, typer.Option(metavar="NAME", help="Copy a published experiment instead; see --list.")]
@@ -96,14 +102,17 @@ def _list_examples() -> None:
 
 
 def _described(data: str) -> dict[str, str]:
-    """Return entries of a file on measured data, after a look at their metadata."""
+    """Return entries of a file on measured data, after a look at them."""
+    from calstudy.instrument.layouts import redundant_groups
+    from calstudy.power.settings import PowerSettings
     from calstudy.realdata.halves import read_facts
     from calstudy.realdata.interference import has_surroundings
     from calstudy.realdata.selection import Selection
     from calstudy.realdata.settings import find_data
 
     try:
-        facts = read_facts((find_data(data, Path()),), Selection(), even=False)
+        paths = (find_data(data, Path()),)
+        facts = read_facts(paths, Selection(), even=False)
     except InputError as error:
         raise InputError(f"--data: {error}") from None
     if facts.times.size < 2:
@@ -111,18 +120,55 @@ def _described(data: str) -> dict[str, str]:
             f"--data: {data} has 1 integration, and a study needs two, for even and odd; join it with others of the "
             "same night, or calibrate it alone with `calstudy calibrate`"
         )
-    first, last = math.floor(facts.frequencies[0] / 1e3), math.ceil(facts.frequencies[-1] / 1e3)
+    frame, whole = facts.frame, _band(facts.frequencies[0], facts.frequencies[-1])
+    vectors = frame.vectors[~frame.autos]
+    groups = redundant_groups(vectors, PowerSettings().redundancy_tolerance).index
     return {
         "path": data if PLAIN_PATH.fullmatch(data) else json.dumps(data, ensure_ascii=False),
-        "summary": f"{facts.antennas} antennas with baselines of up to {facts.frame.lengths.max():.0f} m, "
-        f"{facts.frequencies.size} channels between {first / 1e3:.3f} and {last / 1e3:.3f} MHz, {facts.times.size} "
-        f"integrations, in {facts.unit!r}.",
-        "first": f"{first / 1e3:.3f} MHz",
-        "last": f"{last / 1e3:.3f} MHz",
+        "summary": f"{facts.antennas} antennas with baselines of up to {frame.lengths.max():.0f} m, "
+        f"{(np.bincount(groups)[groups] > 1).sum()} of {len(vectors)} with a redundant partner, "
+        f"{facts.frequencies.size} channels of {whole}, {facts.times.size} integrations, in {facts.unit!r}.",
         "scale": "# " + SCALE if facts.unit.lower() == "jy" else SCALE,
         "autos": "" if facts.autos else "# ",
         "search": "" if has_surroundings(facts.times.size, facts.frequencies.size) else "# ",
+        **_proposed(facts, whole, paths),
     }
+
+
+def _proposed(facts: Facts, whole: str, paths: tuple[Path, ...]) -> dict[str, str]:
+    """Return a band and antennas, after a look at the data unless they are large, with the reasons for them."""
+    from calstudy.products.files import quiet_libraries
+    from calstudy.realdata.interference import quiet_band
+    from calstudy.realdata.noise import uncorrelated
+    from calstudy.realdata.reading import prepare, read_visibilities
+
+    antennas = "# antennas: 0,1,12"
+    if facts.size(facts.times.size).samples > LARGE:
+        return {
+            "band": whole,
+            "band_reason": "All channels; data so large were not searched for interference",
+            "antennas": antennas,
+        }
+    try:
+        with quiet_libraries():
+            data, _ = prepare(read_visibilities(paths))
+    except InputError as error:
+        raise InputError(f"--data: {error}") from None
+    if lost := uncorrelated(data):
+        kept = np.setdiff1d(facts.frame.numbers, lost)
+        antennas = (
+            f"# All but {', '.join(map(str, lost))}, whose cross-correlations are zero, flagged or noise; without this "
+            f"line: all.\n    antennas: {','.join(map(str, kept))}"
+        )
+    found = quiet_band(data)
+    if found is None:
+        return {"band": whole, "band_reason": "All channels: leave out edges and interference", "antennas": antennas}
+    reason = f"The longest stretch of channels that are not flagged and do not stand out from others; all: {whole}"
+    return {"band": _band(*found), "band_reason": reason, "antennas": antennas}
+
+
+def _band(first: float, last: float) -> str:
+    return f"{math.floor(first / 1e3) / 1e3:.3f} MHz..{math.ceil(last / 1e3) / 1e3:.3f} MHz"
 
 
 def write_schema(path: Path) -> None:

@@ -304,8 +304,8 @@ def _not_measured(summary: Mapping[str, Any]) -> list[str]:
     return [
         f"T is not measured at k of {named} h/Mpc: T is the part of the EoR that is left, so that a T below {LOWEST:g} "
         f"or above {HIGHEST:g} is none, and an error above {LARGEST_ERROR:g} leaves open what it is; interference that "
-        "is not flagged (observed.flag_interference: true), few integrations or a weak injection.level are the usual "
-        "reasons"
+        "is not flagged (observed.flag_interference: true; if it is on, select a quieter band), few integrations or a "
+        "weak injection.level are the usual reasons"
     ]
 
 

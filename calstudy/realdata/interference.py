@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -97,12 +98,34 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return values / (np.median(values) or 1.0)
 
 
+def quiet_band(data: UVData) -> tuple[float, float] | None:
+    """Flag interference, and return the ends of the longest stretch of channels without it and other flags, Hz.
+
+    A channel with such is flagged in more than half of the samples of baselines that have any. None if no channel is,
+    or the stretch has too few channels for a search. The data are as those of `flag_interference`.
+    """
+    with suppress(InputError):
+        flag_interference(data, Interference())
+    flags = flag_cube(data)[:, np.not_equal(*antenna_pairs(data).T)]
+    flags = flags[:, ~flags.all(axis=(0, 2, 3))]
+    longest = max(_stretches(flags.sum(axis=(0, 1, 3)) <= flags[:, :, :1].size / 2), key=len, default=np.arange(0))
+    if not LEAST_CHANNELS <= longest.size < data.Nfreqs:
+        return None
+    first, last = np.ravel(data.freq_array)[longest[[0, -1]]]
+    return float(first), float(last)
+
+
+def _stretches(chosen: np.ndarray) -> list[np.ndarray]:
+    """Return the places of consecutive chosen channels."""
+    places = np.flatnonzero(chosen)
+    return np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if places.size else []
+
+
 def _ranges(frequencies: np.ndarray, chosen: np.ndarray) -> list[str]:
     """Return consecutive chosen channels as text, the first `NAMED` of them."""
-    places = np.flatnonzero(chosen)
-    if not places.size:
+    groups = _stretches(chosen)
+    if not groups:
         return []
-    groups = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1)
     texts = [
         f"{frequencies[group[0]] / 1e6:.3f}" + (f" to {frequencies[group[-1]] / 1e6:.3f}" if len(group) > 1 else "")
         for group in groups[:NAMED]

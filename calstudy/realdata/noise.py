@@ -29,6 +29,11 @@ from calstudy.power.spectra import DelaySpectra, outside_wedge
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
+# Median over mean of the square of a complex normal variable.
+MEDIAN_OVER_MEAN = np.log(2)
+ABOVE_NOISE = 2.0
+"""Antennas with a baseline of more than so many times the median power of noise correlate with another."""
+
 
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
     """Return sigma^2 of samples of some baselines by the radiometer equation, (Ntimes, len(pairs), Nfreqs).
@@ -70,6 +75,28 @@ def sample_noise(data: UVData) -> float | None:
         found.append(single[np.isfinite(single)])
     values = np.concatenate(found)
     return float(np.mean(1 / values) ** -0.5) if values.size else None
+
+
+def uncorrelated(data: UVData) -> list[int]:
+    """Return the numbers of antennas without a cross-correlation above the noise: zero, flagged, or noise alone.
+
+    Of noise alone is a baseline whose median of |V|^2 / sigma^2, by the radiometer equation, is less than `ABOVE_NOISE`
+    times that of noise. None are named if they were half of all: then the data are no measure of them. `data` are
+    rectangular and time-major.
+    """
+    pairs = antenna_pairs(data)
+    crosses = np.not_equal(*pairs.T)
+    pairs, values = pairs[crosses], np.abs(np.where(flag_cube(data), 0, to_cube(data))[:, crosses]) ** 2
+    seen = np.asarray(np.any(values > 0, axis=(0, 2)))
+    for polarization in range(data.Npols):
+        variance = radiometer_variance(data, pairs, polarization)
+        if variance is not None:
+            ratios = np.ma.masked_invalid(np.where(values[..., polarization] > 0, values[..., polarization], np.nan))
+            medians = np.ma.median(ratios / np.ma.masked_invalid(variance), axis=(0, 2)).filled(np.inf)
+            seen[:, polarization] &= medians > ABOVE_NOISE * MEDIAN_OVER_MEAN
+    numbers = np.unique(pairs)
+    lost = np.setdiff1d(numbers, pairs[seen.any(axis=1)])
+    return lost.tolist() if 2 * lost.size < numbers.size else []
 
 
 def half_difference(even: UVData, odd: UVData) -> UVData:

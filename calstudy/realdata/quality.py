@@ -24,7 +24,7 @@ from calstudy.base.visibilities import (
 )
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import ForegroundFit, GainFit
-from calstudy.realdata.noise import radiometer_variance
+from calstudy.realdata.noise import MEDIAN_OVER_MEAN, radiometer_variance
 
 if TYPE_CHECKING:
     from calstudy.calibrate.problem import CalibrationProblem
@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 GAIN_FACTOR = 5.0
 # Means of pure noise over many samples scatter by a few per cent.
 CHI2_FACTOR = 3.0
-INTERFERENCE = "interference? (--flag-interference, observed.flag_interference: true)"
+INTERFERENCE = (
+    "interference? (--flag-interference, observed.flag_interference: true; if it is on, select a quieter band)"
+)
 BRIGHT = 2.0
 """Data of a channel over those of the others from which on they tell interference; gains may be high by noise alone."""
 NOISE = (
@@ -42,8 +44,6 @@ NOISE = (
 )
 NAMED = 6
 """Largest number of channels or antennas named in a warning; solution.json has all of them."""
-# Median over mean of the square of a complex normal variable.
-MEDIAN_OVER_MEAN = np.log(2)
 NEIGHBOURS = 1.5
 """Largest distance of compared integrations, in integration times."""
 

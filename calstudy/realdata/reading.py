@@ -61,6 +61,13 @@ def read_visibilities(paths: Sequence[Path], read_data: bool = True) -> UVData:
         return read_visibilities(paths)
     if not np.isfinite(data.telescope.antenna_positions).all():
         raise InputError(f"{names}: antenna positions are not finite")
+    try:
+        data.telescope.get_enu_antpos()
+    except ValueError as error:
+        raise InputError(
+            f"{names}: cannot be read as visibilities (antenna positions: {reason_of(error)}); write them in m, from "
+            "the location of the telescope"
+        ) from None
     _require_plausible(data, names)
     return data
 
@@ -146,7 +153,10 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
     bad = ~np.isfinite(data.data_array) & ~data.flag_array
     if bad.any():
         data.flag_array |= bad
-        notes.append(f"{bad.sum()} samples are not finite (NaN or infinite) and were flagged.")
+        notes.append(f"{bad.sum()} samples are not finite (NaN or infinite) and were flagged{_all_of(data, bad)}.")
+    # Flagged or not, pyuvdata does not write autocorrelations that are not real, and NaN is none.
+    autos = data.ant_1_array == data.ant_2_array
+    data.data_array[autos[:, None, None] & ~np.isfinite(data.data_array)] = 0
     none = (data.nsample_array == 0) & ~data.flag_array
     # Programs that do not count samples leave all numbers at zero.
     if none.any() and data.nsample_array.any():
@@ -155,6 +165,13 @@ def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, li
     for note in notes:
         logger.info(note)
     return data, notes
+
+
+def _all_of(data: UVData, bad: np.ndarray) -> str:
+    """Return words that name antennas of which nothing is left but for these samples, which are flagged; or nothing."""
+    antennas = np.column_stack([data.ant_1_array, data.ant_2_array])
+    gone = np.setdiff1d(antennas[bad.any(axis=(1, 2))], antennas[~data.flag_array.all(axis=(1, 2))])
+    return f", all that there are of antenna(s) {', '.join(map(str, gone))}" if gone.size else ""
 
 
 def _keep_parallel_hands(data: UVData, notes: list[str]) -> None:

@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
+import numpy as np
 from filelock import FileLock, Timeout
 from pydantic import Field, SerializeAsAny, model_validator
 from rich.console import Console
@@ -19,11 +20,11 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
-from calstudy.base.gains import gain_products
+from calstudy.base.gains import gain_products, gains_for
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
-from calstudy.base.visibilities import antenna_pairs, flag_cube
+from calstudy.base.visibilities import antenna_pairs, flag_cube, polarization_names
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
@@ -253,6 +254,11 @@ class DataCalibration(DataStudy):
             if self.start is not None:
                 gains = read_gains(self.start, "calibration.initial_gains.path", data)
                 starting_gains(observation.baselines(fitted), gains)
+                unknown = ~np.isfinite(gains_for(gains, data)).any(axis=(1, 2, 3))
+                if unknown.any():
+                    doubts.append(
+                        f"The gains of {unknown.sum()} of {unknown.size} antennas are flagged; these start from unity."
+                    )
         return [*notes, *doubts]
 
     @property
@@ -325,6 +331,11 @@ class DataCalibration(DataStudy):
         section = self.file.observed
         tasks = (observed(self.graph, WHOLE), *self.tables)
         notes = [made.products[task.key].record["notes"] for task in tasks]
+        # pyuvdata names a polarization by the directions of its feeds; options have the names of the file.
+        names = {
+            f"{item['polarization']}: ": f"{polarization_names([number])}: "
+            for item, number in zip(found["quality"], self.data.facts[WHOLE].polarizations, strict=True)
+        }
         return {
             "calstudy": __version__,
             "data": [str(path) for path in section.data],
@@ -334,7 +345,9 @@ class DataCalibration(DataStudy):
             "flag_interference": section.flag_interference is not None,
             "settings": self.file.calibration.model_dump(mode="json"),
             "notes": notes[0]["changes"],
-            "warnings": [text for note in notes for text in note.get("warnings", ())],
+            "warnings": [
+                names.get(text[:4], text[:4]) + text[4:] for note in notes for text in note.get("warnings", ())
+            ],
             "plan": self.described(),
             "quality": found.pop("quality"),
             "chi_squared": found or None,

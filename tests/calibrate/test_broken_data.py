@@ -236,6 +236,11 @@ def one_place(uvd: UVData) -> UVData:
     return uvd
 
 
+def kilometres(uvd: UVData) -> UVData:
+    uvd.telescope.antenna_positions *= 1e6
+    return uvd
+
+
 def huge(uvd: UVData) -> UVData:
     uvd.data_array *= 1e35
     return uvd
@@ -247,6 +252,7 @@ REFUSALS: dict[str, tuple[Callable[[UVData], UVData], str]] = {
     "pseudo-Stokes": (pseudo_stokes, "no parallel hands"),
     "one channel": (one_channel, "channels"),
     "uneven channels": (uneven, "even grid"),
+    "positions in another unit": (kilometres, "cannot be read as visibilities (antenna positions: "),
 }
 SKIPPED: dict[str, tuple[Callable[[UVData], UVData], str]] = {
     "all flagged": (all_flagged, "every sample is flagged"),

@@ -280,17 +280,35 @@ def test_mistakes_are_one_sentence(command, data, arguments, sentence):
         (["--weights", "autos"], "weights: 'autos' needs autocorrelations, which the data lack for antenna"),
         (["--weights", "weights.h5"], "the channels of the weights are not those of the data"),
         (["--gains", "gains.calh5"], "gains: no solution for antenna(s) 16, 18, 20, 22, 24 of the data"),
+        (["--gains", "flagged.calh5"], "gains: all are flagged, zero or not finite"),
+        (["--sky-model", "dark.uvh5"], "sky model: where the data are, all of it is zero or flagged"),
+        (["--sky-model", "flagged.uvh5"], "sky model: where the data are, all of it is zero or flagged"),
     ],
 )
 def test_a_dry_run_refuses_what_the_run_refuses(command, data, tmp_path, arguments, sentence):
     uvd = UVData.from_file(str(data))
     UVFlag(uvd.select(freq_chans=range(40), inplace=False), mode="metric").write(str(tmp_path / "weights.h5"))
-    gains = make_uvcal(uvd, np.ones((8, 64, 2, 1), complex)).select(antenna_nums=[10, 12, 14], inplace=False)
-    gains.write_calh5(str(tmp_path / "gains.calh5"))
+    whole = make_uvcal(uvd, np.ones((8, 64, 2, 1), complex))
+    whole.select(antenna_nums=[10, 12, 14], inplace=False).write_calh5(str(tmp_path / "gains.calh5"))
+    whole.flag_array[:] = True
+    whole.write_calh5(str(tmp_path / "flagged.calh5"))
+    uvd.flag_array[:] = True
+    uvd.write_uvh5(str(tmp_path / "flagged.uvh5"))
+    uvd.flag_array[:], uvd.data_array[:] = False, 0
+    uvd.write_uvh5(str(tmp_path / "dark.uvh5"))
     for others in (["--dry-run"], ["--output", "out"]):
         code, error = command(data, *OPTIONS, *arguments, *others)
         assert code == 2
         assert sentence in error
+
+
+def test_a_dry_run_says_how_many_antennas_have_no_gains_to_start_from(command, data, tmp_path):
+    gains = make_uvcal(UVData.from_file(str(data)), np.ones((8, 64, 2, 1), complex))
+    gains.flag_array[[1, 3]] = True
+    gains.write_calh5(str(tmp_path / "gains.calh5"))
+    code, told = command(data, *OPTIONS, "--gains", "gains.calh5", "--dry-run")
+    assert code == 0
+    assert "The gains of 2 of 8 antennas are flagged; these start from unity." in told
 
 
 def test_a_dry_run_says_where_no_sample_has_a_weight(command, tmp_path):

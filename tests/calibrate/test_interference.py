@@ -12,7 +12,8 @@ from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
-from calstudy.realdata.interference import flag_interference
+from calstudy.realdata.interference import flag_interference, quiet_band
+from calstudy.realdata.noise import uncorrelated
 from calstudy.realdata.reading import prepare, read_visibilities
 from calstudy.realdata.selection import Selection
 from calstudy.realdata.settings import Interference, find_data
@@ -169,3 +170,22 @@ def test_autocorrelations_alone_are_refused(clean):
     autos.ant_2_array = autos.ant_1_array.copy()
     with pytest.raises(InputError, match="is for cross-correlations, and the data hold none"):
         flag_interference(autos, Interference())
+
+
+def test_the_quiet_band_is_the_longest_without_interference_or_flags(clean):
+    assert quiet_band(clean.copy()) is None
+    data, _ = spoiled(clean)
+    assert quiet_band(data.copy()) == (data.freq_array[SOMETIMES[1] + 1], data.freq_array[-1])
+    data = clean.copy()
+    data.flag_array[:, 40:45] = True
+    assert quiet_band(data) == (data.freq_array[0], data.freq_array[39])
+
+
+def test_antennas_without_a_signal_are_named_unless_they_are_half(clean):
+    assert uncorrelated(clean) == []
+    data = clean.copy()
+    data.data_array[(data.ant_1_array == 12) | (data.ant_2_array == 12)] = 0
+    data.flag_array[(data.ant_1_array == 16) | (data.ant_2_array == 16)] = True
+    assert uncorrelated(data) == [12, 16]
+    data.flag_array[data.ant_2_array > 16] = True
+    assert uncorrelated(data) == []

@@ -98,7 +98,7 @@ def test_gains_that_stand_out_are_named(clean):
     gains[ANTENNA] *= 0.1
     loud = clean.copy()
     loud.data_array[:, CHANNEL] *= 50
-    for data, question in ((loud, "interference?"), (clean, "the data are not: noise?")):
+    for data, question in ((loud, "interference? (--flag-interference"), (clean, "the data are not: noise?")):
         told = assess(data, result_of(data, normal(data), gains)).warnings
         assert len(told) == 2
         assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); {question}" in told[0]
@@ -244,6 +244,8 @@ def test_interference_is_warned_of_and_written(files, clean, capsys):
     assert status == 0
     named = f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (100 x); interference?"
     assert named in told.out
+    # By the name of the polarization in the file and in --select, which pyuvdata calls ee.
+    assert "warning: xx: |g| is far above" in told.out
     (quality,) = json.loads((files / "out" / "solution.json").read_text())["quality"]
     assert any(named in warning for warning in quality["warnings"])
     assert quality["gain_by_channel"][CHANNEL] == pytest.approx(100, rel=1e-3)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from observations import small_instrument
 from pyuvdata import UVData
+from toy import make_toy, scattered
 from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
@@ -78,6 +79,17 @@ def test_values_that_are_not_finite_are_flagged_and_counted(data):
     prepared, notes = prepare(data)
     assert prepared.flag_array[5, 3].all()
     assert notes == ["1 samples are not finite (NaN or infinite) and were flagged."]
+
+
+def test_antennas_of_which_nothing_is_finite_are_named_and_can_be_written(tmp_path):
+    data = make_uvdata(make_toy(scattered(5), autos=True), 2)
+    autos = data.ant_1_array == data.ant_2_array
+    data.data_array[autos] = np.abs(data.data_array[autos])
+    data.data_array[(data.ant_1_array == 12) | (data.ant_2_array == 12)] = complex(np.nan, np.nan)
+    data.data_array[0] = np.nan
+    prepared, (note,) = prepare(data)
+    assert note.endswith("are not finite (NaN or infinite) and were flagged, all that there are of antenna(s) 12.")
+    prepared.write_uvh5(str(tmp_path / "data.uvh5"))
 
 
 def test_data_without_common_times_are_refused(data):

@@ -145,6 +145,7 @@ def test_csv_layout(tmp_path):
         # The layout format of pyuvsim, and what spreadsheets write.
         "# core\nName  Number  BeamID  E  N  U\na  7  0  0  0  0\n# broken\nb  3  0  10  2.5  -1\n",
         "Name;Number;East;North;Up\na;7;0;0;0\nb;3;10;2.5;-1\n",
+        "name,number,east_m,north_m,up_m\na,7.0,0,0,0\nb,3e0,10,2.5,-1\n",
         # Local positions count, columns without a use may have no name, and cells may be empty.
         "name,number,east_m,north_m,up_m,lat,lon,,\na,7,0,0,0,1,2,,\nb,3,10,2.5,-1,1,2,,\n",
         "name\tnumber\teast_m\tnorth_m\tup_m\tnote\na\t7\t0\t0\t0\t\nb\t3\t10\t2.5\t-1\t\n",
@@ -199,7 +200,8 @@ def test_positions_in_degrees_are_compared_with_the_site(tmp_path):
         ("number,east_m,north_m,up_m\n1,0,0,0\n3000000000,1,0,0\n", "antenna number 3000000000 .* exceeds"),
         ("e,east_m,n,u\n0,0,0,0\n1,1,1,1\n", "twice"),
         ("# HERA\ne n u\n0 0 0\n\n1 1\n", "line 5 of .* cells"),
-        ("east_m,north_m\n0,0\n1,1\n", "up_m"),
+        ("east_m,north_m,z\n0,0,0\n1,1,0\n", "missing: up_m; found: 2 rows of east_m, north_m, z"),
+        ("number,east_m,north_m,up_m\n1.5,0,0,0\n2,1,0,0\n", "line 2 of .* not a number .*'1.5'"),
         ("east_m,north_m,up_m\n0,0,0\n1,x,0\n", "line 3 of .* not a number .*'x'"),
         ("east_m,north_m,up_m\n0,0,0\n", "two rows"),
         ("number,east_m,north_m,up_m\n1,0,0,0\n1,1,0,0\n", "unique; see '1'"),

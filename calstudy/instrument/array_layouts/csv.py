@@ -63,13 +63,14 @@ def read_positions(path: Path, numbered: bool = False) -> Layout:
     if not path.is_file():
         raise InputError(f"instrument.layout.path: there is no file {path}")
     lines, rows = _read_rows(path)
-    columns = set(rows[0]) if rows else set()
-    geodetic = {"latitude", "longitude"} <= columns and not set(LOCAL) <= columns
-    missing = set(GEODETIC if geodetic else LOCAL) - columns
+    columns = list(rows[0]) if rows else []
+    geodetic = {"latitude", "longitude"} <= set(columns) and not set(LOCAL) <= set(columns)
+    missing = set(GEODETIC if geodetic else LOCAL).difference(columns)
     if missing or len(rows) < 2:
+        lacking = f"; missing: {', '.join(sorted(missing))}" if rows and missing else ""
         raise InputError(
-            f"instrument.layout.path: {path} needs at least two rows with columns east_m, north_m, up_m, or "
-            "latitude, longitude, height_m" + (f"; missing: {', '.join(sorted(missing))}" if missing else "")
+            f"instrument.layout.path: {path} needs at least two rows with columns east_m, north_m, up_m, or latitude, "
+            f"longitude, height_m{lacking}; found: {len(rows)} rows of {', '.join(columns) or 'nothing'}"
         )
     if numbered and "number" not in columns:
         raise InputError(f"instrument.layout.path: {path} needs a column number, by which antennas are found")
@@ -77,7 +78,7 @@ def read_positions(path: Path, numbered: bool = False) -> Layout:
     for index, (line, row) in enumerate(zip(lines, rows, strict=True)):
         try:
             positions[index] = [float(row[name]) for name in (GEODETIC if geodetic else LOCAL)]
-            found.append(int(row.get("number", str(index))))
+            found.append(_whole(row.get("number", str(index))))
         except ValueError as error:
             raise InputError(
                 f"instrument.layout.path: line {line} of {path} holds an entry that is not a number ({error})"
@@ -92,6 +93,14 @@ def read_positions(path: Path, numbered: bool = False) -> Layout:
         positions, place = _about_their_mean(positions, lines, path)
     names = tuple(row["name"] for row in rows) if "name" in columns else tuple(f"ant{n:03d}" for n in numbers)
     return Layout(path.stem, numbers, names, positions, place, surveyed=geodetic)
+
+
+def _whole(text: str) -> int:
+    """Return the number of an antenna, which some programs write as 7.0; raises ValueError if it is not whole."""
+    number = float(text)
+    if not number.is_integer():
+        raise ValueError(f"antenna number {text!r} is not whole")
+    return int(number)
 
 
 def _read_rows(path: Path) -> tuple[list[int], list[dict[str, str]]]:
