@@ -99,7 +99,7 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
             return existing if existing is not None else _make(order, store)
     except InputError:
         raise
-    except SystemExit as error:
+    except (SystemExit, KeyboardInterrupt) as error:
         # It would end the thread of the worker silently, and the run would wait for it forever.
         raise RuntimeError(f"{order.name}: the process was told to exit") from error
     except (OSError, RuntimeError) as error:

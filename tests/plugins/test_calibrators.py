@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from command_line import run_command
+from command_line import run_command, time_limit
 from own_calibrators import KNOWN_GAINS, install, write_calibrator
 from tiny import load, tiny
 
@@ -197,12 +197,14 @@ def test_the_calibrate_command_refuses_in_a_sentence(reference, observed, tmp_pa
         ("exit", "known_gains.py line 42, in spoiled: it ended the process (sys.exit, status 5)"),
         ("value", "known_gains.py line 44, in spoiled: ValueError: no such thing"),
         ("type", "known_gains.py line 46, in spoiled: TypeError: object of type 'int' has no len()"),
+        ("interrupt", "known_gains.py line 74, in spoiled: it ended the process (KeyboardInterrupt)"),
     ],
 )
 def test_an_error_ends_a_run_with_the_line_of_the_users_code(tmp_path, capsys, fault, told):
     reference = write_calibrator(tmp_path).name
     path = experiment(tmp_path, {"calibrator": reference, "fault": fault})
-    code, error = run_command(capsys, "run", path, "--workers", 1)
+    with time_limit(120):
+        code, error = run_command(capsys, "run", path, "--workers", 1)
     complaints = [line for line in error.splitlines() if line.startswith("calstudy:")]
     assert code == 2, error
     assert len(complaints) == 1, error

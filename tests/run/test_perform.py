@@ -237,6 +237,9 @@ from calstudy.run.task import Task
 def leave(output):
     sys.exit(3)
 
+def interrupt(output):
+    raise KeyboardInterrupt
+
 def write_much(output):
     (output / "much").write_bytes(bytes(10**6))
     return {{}}
@@ -286,12 +289,12 @@ def program(folder: Path, make: str, workers: int = 1, before: str = "") -> subp
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False, timeout=120)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, workers):
-    result = program(tmp_path, "leave", workers)
+@pytest.mark.parametrize(("make", "workers"), [("leave", 1), ("leave", 2), ("interrupt", 1), ("interrupt", 2)])
+def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, make, workers):
+    result = program(tmp_path, make, workers)
     assert result.returncode == 1
     assert "RuntimeError: stage (label): the process was told to exit" in result.stderr
-    assert "in leave" in result.stderr
+    assert f"in {make}" in result.stderr
 
 
 def test_workers_end_at_once_and_do_not_free_what_libraries_hold(tmp_path):
