@@ -35,7 +35,9 @@ def test_a_file_comes_before_a_published_experiment_of_its_name(monkeypatch, tmp
     assert find_experiment(Path("quickstart")) == Path("quickstart")
     for path in (Path("mine.yaml"), Path("folder/quickstart")):
         assert find_experiment(path) == path
-    with pytest.raises(InputError, match=r"quickstrat: neither a file nor a published experiment, did you mean 'quickstart'\?"):
+    with pytest.raises(
+        InputError, match=r"quickstrat: neither a file nor a published experiment, did you mean 'quickstart'\?"
+    ):
         find_experiment(Path("quickstrat"))
 
 
