@@ -274,6 +274,9 @@ def user_code(name: str) -> Iterator[None]:
         if isinstance(error, SystemExit | KeyboardInterrupt):
             how = f"sys.exit, status {error.code}" if isinstance(error, SystemExit) else "KeyboardInterrupt"
             text = f"it ended the process ({how}); raise an error instead"
+        elif getattr(error, "code", None) == "model-field-missing-annotation":
+            given = str(error).split("`")[1]
+            text = f"`{given}` has no type: write one, as in `size: float = 1.0`, or ClassVar where it is no setting"
         else:
             text = f"{type(error).__name__}: {error}"
         raise UserCodeError(f"{place}: {text}") from error

@@ -29,6 +29,14 @@ from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study
 
+UNFINISHED = """
+from calstudy.calibrate.interface import Calibrator
+class Mine(Calibrator):
+    def solve(self): ...
+class Other(Calibrator):
+    def solve(self): ...
+"""
+
 
 @pytest.fixture(params=["path", "entry point"])
 def reference(request, tmp_path, monkeypatch) -> Iterator[str]:
@@ -307,6 +315,9 @@ def test_what_does_not_fit_is_refused_in_a_sentence(observed, tmp_path, fault, t
         ("def f(:\n", "known_gains.py", "is not valid Python (line 1:"),
         ("import sys\nsys.exit()\n", "known_gains.py", "known_gains.py line 2, in <module>: it ended the process"),
         ("x = 1\n", "known_gains.py", "must hold one calibrator"),
+        (UNFINISHED, "known_gains.py", "':Class' (it has: Mine without calibrate; Other without calibrate)"),
+        (UNFINISHED, "known_gains.py:Mine", "this name (it has: Mine without calibrate; Other without calibrate)"),
+        (UNFINISHED + "    size = 3\n", "known_gains.py", "`size = 3` has no type: write one, as in `size: float"),
         (
             KNOWN_GAINS,
             "calamty",
