@@ -227,7 +227,7 @@ def test_an_input_that_vanished_is_told_in_a_sentence(store):
 
 
 PROGRAM = """
-import resource, signal, sys
+import os, resource, signal, sys
 from pathlib import Path
 from calstudy.base.errors import InputError
 from calstudy.run.execution import Workers, execute, schedule
@@ -239,6 +239,10 @@ def leave(output):
 
 def interrupt(output):
     raise KeyboardInterrupt
+
+def require_path(output):
+    assert "PYTHONSAFEPATH" not in os.environ
+    return {{}}
 
 def write_much(output):
     (output / "much").write_bytes(bytes(10**6))
@@ -282,10 +286,12 @@ if __name__ == "__main__":
 """
 
 
-def program(folder: Path, make: str, workers: int = 1, before: str = "") -> subprocess.CompletedProcess:
+def program(
+    folder: Path, make: str, workers: int = 1, before: str = "", name: str = "program.py"
+) -> subprocess.CompletedProcess:
     """Run a stage in a process of its own, which must end by itself."""
-    (folder / "program.py").write_text(PROGRAM.format(make=make, workers=workers, before=before))
-    command = [sys.executable, "program.py"]
+    (folder / name).write_text(PROGRAM.format(make=make, workers=workers, before=before))
+    command = [sys.executable, name]
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False, timeout=120)
 
 
@@ -295,6 +301,14 @@ def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, make, worker
     assert result.returncode == 1
     assert "RuntimeError: stage (label): the process was told to exit" in result.stderr
     assert f"in {make}" in result.stderr
+
+
+def test_workers_take_no_file_of_the_working_folder_for_a_module_of_python(tmp_path):
+    (tmp_path / "signal.py").write_text("raise ImportError('not this one')")
+    (tmp_path / "code").mkdir()
+    result = program(tmp_path, "require_path", workers=2, name="code/program.py")
+    assert result.returncode == 0, result.stderr
+    assert "not this one" not in result.stderr
 
 
 def test_workers_end_at_once_and_do_not_free_what_libraries_hold(tmp_path):
