@@ -207,7 +207,11 @@ def test_what_a_terminal_cannot_show_is_a_question_mark(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["array", "copy", "logging", "signal"])
-def test_a_file_of_the_working_folder_is_not_taken_for_a_module_of_python(tmp_path, name):
+def test_a_file_of_the_working_folder_is_not_taken_for_a_module_of_python(tmp_path, monkeypatch, name):
+    # As in an environment that is in the working folder.
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "calstudy").symlink_to(Path(__file__).parents[1] / "calstudy")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     (tmp_path / f"{name}.py").write_text("raise ImportError('not this one')")
     result = calstudy("--version", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
