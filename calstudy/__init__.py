@@ -2,16 +2,12 @@
 
 import os
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 
 # TensorFlow rounds differently with these kernels and without. It reads this once, when it is imported, in whichever
 # process that is first: results must not depend on whether that is a worker or not.
 os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "0")
 
-try:
-    __version__ = version("calstudy")
-except PackageNotFoundError:
-    __version__ = "0+unknown"
+__version__: str
 
 # `calibrate` is the package of that name.
 INTERFACE = {
@@ -29,6 +25,14 @@ def __getattr__(name: str) -> object:
     # What these functions need takes a second to import, which commands such as --help do without.
     if name in INTERFACE:
         return getattr(import_module(f"calstudy.{INTERFACE[name]}"), name)
+    if name == "__version__":
+        # Imported above, it would import array.py of a working folder before `__main__` can leave that out.
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("calstudy")
+        except PackageNotFoundError:
+            return "0+unknown"
     raise AttributeError(f"module 'calstudy' has no attribute {name!r}")
 
 

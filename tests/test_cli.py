@@ -1,6 +1,7 @@
 """The command line: quick, and clear about mistakes."""
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -194,6 +195,26 @@ def test_a_crash_of_a_library_shows_on_the_terminal_where_it_was(tmp_path):
     assert result.returncode < 0
     assert "Segmentation fault" in result.stderr
     assert "in crash" in result.stderr
+
+
+def test_what_a_terminal_cannot_show_is_a_question_mark(tmp_path):
+    code = "from calstudy.cli import main as cli\ncli.app = lambda: print('1 \xb1 2')\ncli.main()"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == "1 ? 2\n"
+
+
+@pytest.mark.parametrize("name", ["array", "copy", "logging", "signal"])
+def test_a_file_of_the_working_folder_is_not_taken_for_a_module_of_python(tmp_path, monkeypatch, name):
+    # As in an environment that is in the working folder.
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "calstudy").symlink_to(Path(__file__).parents[1] / "calstudy")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    (tmp_path / f"{name}.py").write_text("raise ImportError('not this one')")
+    result = calstudy("--version", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
 
 
 def test_a_plan_computes_and_writes_nothing(here, capsys):

@@ -61,6 +61,15 @@ def test_a_new_experiment_is_valid_with_and_without_its_commented_fields(here, c
     assert Path(text.splitlines()[0].partition("$schema=")[2]).is_file()
 
 
+@pytest.mark.parametrize(("folder", "named"), [(".", "published/experiments/"), ("published/experiments", "")])
+def test_a_new_experiment_names_a_schema_of_its_folder_by_a_relative_path(here, capsys, monkeypatch, folder, named):
+    monkeypatch.setattr("calstudy.base.package_files.PUBLISHED", here / "published")
+    (here / "published" / "experiments").mkdir(parents=True)
+    monkeypatch.chdir(here / folder)
+    output_of(capsys, "init", "mine")
+    assert Path("mine.yaml").read_text().splitlines()[0] == f"# yaml-language-server: $schema={named}{SCHEMA_FILE}"
+
+
 def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
     output_of(capsys, "init", "mine", "--example", "lowsnr")
     copied, original = (

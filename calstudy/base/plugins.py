@@ -215,18 +215,32 @@ class Registry(Kinds[P]):
         """Return the only class that a module defines, or the one of this name."""
         found = self._things(module)
         if name is not None and name not in found:
-            raise InputError(f"{reference!r} holds no {self.noun} of this name (it has: {', '.join(found) or 'none'})")
+            raise InputError(f"{reference!r} holds no {self.noun} of this name (it has: {self._listed(module)})")
         if name is None and len(found) != 1:
-            listed = ", ".join(found) if found else f"no subclass of {self.base.__module__}.{self.base.__name__}"
-            raise InputError(f"{reference!r} must hold one {self.noun}, or be followed by ':Class' (it has: {listed})")
+            raise InputError(
+                f"{reference!r} must hold one {self.noun}, or be followed by ':Class' (it has: {self._listed(module)})"
+            )
         return found[name or next(iter(found))]
 
-    def _things(self, module: ModuleType) -> dict[str, type[P]]:
-        """Return the classes that a module defines, by name."""
-        return {key: value for key, value in vars(module).items() if self._is_thing(value, module)}
+    def _listed(self, module: ModuleType) -> str:
+        """Return the names of a module's classes, and what those that cannot be used lack."""
+        lacking = [
+            f"{name} without {', '.join(sorted(value.__abstractmethods__))}"
+            for name, value in self._things(module, abstract=True).items()
+        ]
+        base = f"no subclass of {self.base.__module__}.{self.base.__name__}"
+        return "; ".join([*self._things(module), *lacking]) or base
+
+    def _things(self, module: ModuleType, abstract: bool = False) -> dict[str, type[P]]:
+        """Return the classes that a module defines, by name; or those `abstract`, which lack methods."""
+        return {
+            name: value
+            for name, value in vars(module).items()
+            if self._is_thing(value, module) and inspect.isabstract(value) == abstract
+        }
 
     def _is_thing(self, value: Any, module: ModuleType) -> bool:
-        if not (inspect.isclass(value) and issubclass(value, self.base)) or inspect.isabstract(value):
+        if not (inspect.isclass(value) and issubclass(value, self.base)):
             return False
         return value is not self.base and value.__module__ == module.__name__ and not value.__name__.startswith("_")
 

@@ -16,7 +16,7 @@ from functools import lru_cache
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
-from threading import Lock
+from threading import Lock, current_thread, main_thread
 from types import ModuleType
 from typing import Any
 
@@ -256,20 +256,27 @@ def user_code(name: str) -> Iterator[None]:
     """Run a user's code; its errors, SystemExit included, become a `UserCodeError` that names the line, or else `name`.
 
     `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
-    defects of calstudy, except where the call itself does not fit the user's function.
+    defects of calstudy, except where the call itself does not fit the user's function. KeyboardInterrupt passes in the
+    main thread, where it is Ctrl-C.
     """
     try:
         yield
-    except (InputError, KeyboardInterrupt, GeneratorExit):
+    except (InputError, GeneratorExit):
         raise
     except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
+            raise
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
         if not frames and not isinstance(error, TypeError | SystemExit | ImportError):
             raise
         lines = [f"{Path(frame.filename).name} line {frame.lineno}, in {frame.name}" for frame in frames[-1:]]
         place = lines[0] if lines else name
-        if isinstance(error, SystemExit):
-            text = f"it ended the process (sys.exit, status {error.code}); raise an error instead"
+        if isinstance(error, SystemExit | KeyboardInterrupt):
+            how = f"sys.exit, status {error.code}" if isinstance(error, SystemExit) else "KeyboardInterrupt"
+            text = f"it ended the process ({how}); raise an error instead"
+        elif getattr(error, "code", None) == "model-field-missing-annotation":
+            given = str(error).split("`")[1]
+            text = f"`{given}` has no type: write one, as in `size: float = 1.0`, or ClassVar where it is no setting"
         else:
             text = f"{type(error).__name__}: {error}"
         raise UserCodeError(f"{place}: {text}") from error

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from io import TextIOWrapper
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, NoReturn
@@ -291,6 +292,9 @@ def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
     there.
     """
     logging.getLogger().addHandler(logging.NullHandler())
+    if isinstance(sys.stdout, TextIOWrapper):
+        # What a terminal cannot show, such as ± in ASCII, is a question mark there.
+        sys.stdout.reconfigure(errors="replace")
     if not faulthandler.is_enabled():
         # The terminal shows the place of a library's crash: a run writes standard error itself to a file.
         faulthandler.enable(os.dup(2), all_threads=False)

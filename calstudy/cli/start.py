@@ -71,7 +71,10 @@ def init(
         text = _filled("starter", name=name) if example is None else _copy(example, name)
     if path.exists():
         raise InputError(f"{path}: exists already, and is not overwritten; choose another name or remove it")
-    path.write_text(f"{MODELINE}{published('experiments') / SCHEMA_FILE}\n{text}", encoding="utf-8")
+    schema = published("experiments") / SCHEMA_FILE
+    if schema.is_relative_to(Path.cwd()):
+        schema = schema.relative_to(Path.cwd())
+    path.write_text(f"{MODELINE}{schema}\n{text}", encoding="utf-8")
     typer.echo(f"{path}: next, `calstudy plan {path}`")
 
 

@@ -82,10 +82,18 @@ def _as_list(paths: Any) -> Any:
     return [paths] if isinstance(paths, str | Path) else paths
 
 
+def _require_different(paths: tuple[Path, ...]) -> tuple[Path, ...]:
+    for place, path in enumerate(paths):
+        if path in paths[:place]:
+            raise fault("", f"{path} is given twice; leave one out")
+    return paths
+
+
 DataFile = Annotated[Path, BeforeValidator(_find), Field(strict=False)]
 DataFiles = Annotated[
     tuple[DataFile, ...],
     BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...]),
+    AfterValidator(_require_different),
     Field(strict=False),
 ]
 

@@ -99,7 +99,7 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
             return existing if existing is not None else _make(order, store)
     except InputError:
         raise
-    except SystemExit as error:
+    except (SystemExit, KeyboardInterrupt) as error:
         # It would end the thread of the worker silently, and the run would wait for it forever.
         raise RuntimeError(f"{order.name}: the process was told to exit") from error
     except (OSError, RuntimeError) as error:
@@ -323,6 +323,8 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
 def _set_up_worker(log: Path) -> None:
     """Prepare a process of this machine for orders."""
     write_errors_to(log)
+    # It was for the start of this process, and not for what users' code starts.
+    os.environ.pop("PYTHONSAFEPATH", None)
     # Orders need it when they arrive, in one thread, and stages in another: two threads that import it at once can lock
     # each other out (`_frozen_importlib._DeadlockError`).
     import_module("astropy.units")
@@ -363,6 +365,8 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
 def _cluster(workers: int) -> LocalCluster:
     from distributed import LocalCluster
 
+    # A new process would take signal.py of the working folder for Python's own, before it has the path of this one.
+    os.environ["PYTHONSAFEPATH"] = "1"
     try:
         return LocalCluster(
             n_workers=workers,
@@ -379,6 +383,8 @@ def _cluster(workers: int) -> LocalCluster:
             "worker processes cannot be started; in a Python script, put what runs studies below `if __name__ == "
             f'"__main__":`, or use workers=1 ({error})'
         ) from None
+    finally:
+        os.environ.pop("PYTHONSAFEPATH", None)
 
 
 @contextmanager

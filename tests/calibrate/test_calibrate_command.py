@@ -241,6 +241,7 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
     ("arguments", "sentence"),
     [
         (["none.uvh5"], "'none.uvh5': no such file or folder"),
+        (["data.uvh5", "./data.uvh5"], "data.uvh5 is given twice; leave one out"),
         (["data.uvh5", "--solver", "newton"], "solver: 'newton' is not a choice"),
         (["data.uvh5", "--buffer", "50"], "basis.buffer: '50' has no unit"),
         (["data.uvh5", "--set", "bufer=3"], "bufer: unknown key"),

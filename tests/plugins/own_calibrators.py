@@ -77,6 +77,8 @@ def spoiled(fault, observation, assumed, gains, outcome):
         cal = make_uvcal(observation.uvd, gains)
         cal.gain_convention = "multiply"
         return Calibration(gains=cal, outcomes=outcome)
+    if fault == "interrupt":
+        raise KeyboardInterrupt
     raise LookupError(fault)
 '''
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from command_line import run_command
+from command_line import run_command, time_limit
 from own_calibrators import KNOWN_GAINS, install, write_calibrator
 from tiny import load, tiny
 
@@ -28,6 +28,14 @@ from calstudy.products.spectra import power
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study
+
+UNFINISHED = """
+from calstudy.calibrate.interface import Calibrator
+class Mine(Calibrator):
+    def solve(self): ...
+class Other(Calibrator):
+    def solve(self): ...
+"""
 
 
 @pytest.fixture(params=["path", "entry point"])
@@ -197,12 +205,14 @@ def test_the_calibrate_command_refuses_in_a_sentence(reference, observed, tmp_pa
         ("exit", "known_gains.py line 42, in spoiled: it ended the process (sys.exit, status 5)"),
         ("value", "known_gains.py line 44, in spoiled: ValueError: no such thing"),
         ("type", "known_gains.py line 46, in spoiled: TypeError: object of type 'int' has no len()"),
+        ("interrupt", "known_gains.py line 74, in spoiled: it ended the process (KeyboardInterrupt)"),
     ],
 )
 def test_an_error_ends_a_run_with_the_line_of_the_users_code(tmp_path, capsys, fault, told):
     reference = write_calibrator(tmp_path).name
     path = experiment(tmp_path, {"calibrator": reference, "fault": fault})
-    code, error = run_command(capsys, "run", path, "--workers", 1)
+    with time_limit(120):
+        code, error = run_command(capsys, "run", path, "--workers", 1)
     complaints = [line for line in error.splitlines() if line.startswith("calstudy:")]
     assert code == 2, error
     assert len(complaints) == 1, error
@@ -305,6 +315,9 @@ def test_what_does_not_fit_is_refused_in_a_sentence(observed, tmp_path, fault, t
         ("def f(:\n", "known_gains.py", "is not valid Python (line 1:"),
         ("import sys\nsys.exit()\n", "known_gains.py", "known_gains.py line 2, in <module>: it ended the process"),
         ("x = 1\n", "known_gains.py", "must hold one calibrator"),
+        (UNFINISHED, "known_gains.py", "':Class' (it has: Mine without calibrate; Other without calibrate)"),
+        (UNFINISHED, "known_gains.py:Mine", "this name (it has: Mine without calibrate; Other without calibrate)"),
+        (UNFINISHED + "    size = 3\n", "known_gains.py", "`size = 3` has no type: write one, as in `size: float"),
         (
             KNOWN_GAINS,
             "calamty",

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import yaml
 from command_line import run_command
@@ -15,6 +17,7 @@ from rich.console import Console
 from tiny import tiny
 
 from calstudy.base.errors import InputError
+from calstudy.base.user_code import load_file
 from calstudy.claims.evaluation import evaluate_folder
 from calstudy.experiment.files import override, validate
 from calstudy.regression import accept, read_reference
@@ -67,6 +70,13 @@ def test_its_statements_are_judged_as_they_come_out(folder):
     assert "claims: 2 sentences: 1 supported, 1 contradicted; 2 statements: 1 supported, 1 contradicted" in shown
     (table,) = [table for table in read_contents(RunFolder(run.folder)).tables if table.title == "Claims of the paper"]
     assert [row[-1] for row in table.rows] == ["supported", "contradicted"]
+
+
+def test_it_leaves_out_bins_without_modes(tmp_path):
+    (tmp_path / "hexagons.py").write_text(CODE)
+    spectrum = SimpleNamespace(k=np.array([0.2, 0.4, 0.6]), power=np.array([1, 2, np.nan], complex))
+    kept = load_file(tmp_path / "hexagons.py").signal_kept
+    assert kept.measure(SimpleNamespace(spherical=lambda *_: spectrum)).value == 1
 
 
 def test_an_installed_one_is_used_by_its_name_and_beside_others(folder, monkeypatch, tmp_path):

@@ -227,7 +227,7 @@ def test_an_input_that_vanished_is_told_in_a_sentence(store):
 
 
 PROGRAM = """
-import resource, signal, sys
+import os, resource, signal, sys
 from pathlib import Path
 from calstudy.base.errors import InputError
 from calstudy.run.execution import Workers, execute, schedule
@@ -236,6 +236,13 @@ from calstudy.run.task import Task
 
 def leave(output):
     sys.exit(3)
+
+def interrupt(output):
+    raise KeyboardInterrupt
+
+def require_path(output):
+    assert "PYTHONSAFEPATH" not in os.environ
+    return {{}}
 
 def write_much(output):
     (output / "much").write_bytes(bytes(10**6))
@@ -279,19 +286,29 @@ if __name__ == "__main__":
 """
 
 
-def program(folder: Path, make: str, workers: int = 1, before: str = "") -> subprocess.CompletedProcess:
+def program(
+    folder: Path, make: str, workers: int = 1, before: str = "", name: str = "program.py"
+) -> subprocess.CompletedProcess:
     """Run a stage in a process of its own, which must end by itself."""
-    (folder / "program.py").write_text(PROGRAM.format(make=make, workers=workers, before=before))
-    command = [sys.executable, "program.py"]
+    (folder / name).write_text(PROGRAM.format(make=make, workers=workers, before=before))
+    command = [sys.executable, name]
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, check=False, timeout=120)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, workers):
-    result = program(tmp_path, "leave", workers)
+@pytest.mark.parametrize(("make", "workers"), [("leave", 1), ("leave", 2), ("interrupt", 1), ("interrupt", 2)])
+def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, make, workers):
+    result = program(tmp_path, make, workers)
     assert result.returncode == 1
     assert "RuntimeError: stage (label): the process was told to exit" in result.stderr
-    assert "in leave" in result.stderr
+    assert f"in {make}" in result.stderr
+
+
+def test_workers_take_no_file_of_the_working_folder_for_a_module_of_python(tmp_path):
+    (tmp_path / "signal.py").write_text("raise ImportError('not this one')")
+    (tmp_path / "code").mkdir()
+    result = program(tmp_path, "require_path", workers=2, name="code/program.py")
+    assert result.returncode == 0, result.stderr
+    assert "not this one" not in result.stderr
 
 
 def test_workers_end_at_once_and_do_not_free_what_libraries_hold(tmp_path):
