@@ -189,6 +189,11 @@ class Family(Study):
         return self.studies
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the members, once each."""
+        return tuple(dict.fromkeys(note for study in self.studies.values() for note in study.notes))
+
+    @property
     def outputs(self) -> Folders:
         """Store and folder of runs."""
         return next(iter(self.members.values())).outputs
