@@ -103,7 +103,8 @@ class Sweep(Family):
     def tables(self) -> list[Task]:
         """The signal loss and the bias of all points."""
         changes = [{path: item} for block in self.file.sweep for path, values in block.items() for item in values]
-        points, inputs = {}, {}
+        points: dict[str, Any] = {}
+        inputs: dict[str, Task] = {}
         for label, study in self.studies.items():
             experiment, measured = study.experiment, required(score(study.graph))
             points[label] = {"fields": fields_of(experiment, changes), "wedge_buffer": experiment.power.wedge_buffer}
