@@ -266,6 +266,15 @@ def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path,
     assert told in " ".join(planned(capsys, "--set", change, "--set", "instrument.times.integration=10 s").split())
 
 
+def test_a_run_shows_the_notes_of_its_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    for name in ("study.run_study", "show.show_run"):
+        monkeypatch.setattr(f"calstudy.studies.{name}", lambda *_: None)
+    cli.app(["run", "file.yaml", "--set", "simulation.chunks=50"], standalone_mode=False)
+    assert "note: simulation.chunks = 50" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
