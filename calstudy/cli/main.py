@@ -121,6 +121,8 @@ def run(
     if finished:
         _require_not_strict(strict)
         study = study.with_finished(finished, console)
+    for note in study.notes:
+        console.print(f"note: {note}", markup=False)
     show_run(run_study(study, Budget(workers, max_memory, scheduler, strict), console), console)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, model_validator
 
@@ -124,6 +124,12 @@ class Folders(Section):
 
     store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
     runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+
+    @model_validator(mode="after")
+    def _folders_differ(self) -> Self:
+        if self.store.absolute() == self.runs.absolute():
+            raise fault("runs", f"{str(self.runs)!r} is also outputs.store; give each its own folder")
+        return self
 
 
 class Outputs(Folders):

@@ -18,6 +18,7 @@ from calstudy.power.tables import load_spectrum
 from calstudy.products import spectra
 from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, read_json
 from calstudy.products.graph import size_of
+from calstudy.products.signal_loss import statuses
 from calstudy.products.tolerances import COUNTS, faults, tolerance
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.standing import LIMIT, advice, is_measured, marked, standing_table, standings, upper_limit
@@ -59,7 +60,9 @@ def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Any],
     Parameters
     ----------
     title : name of the study
-    labels : ``calibrators`` and ``worlds`` in order, and ``refusals``: world, calibrator and why it cannot work there
+    labels
+        ``calibrators`` and ``worlds`` in order, ``fields`` that each world changes with their values, and ``refusals``:
+        world, calibrator and why it cannot work there
     scores : of all other cases, by `case_name`
     notes : what stands in for the papers' own ingredients
     """
@@ -107,15 +110,16 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=7):
+class Comparison(Task, stage="comparison", version=8):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
 
-    Severities such as ``.5 cm``, and signs after a text, are read as they are written since version 7.
+    The CSV has the fields that worlds change since version 8.
     """
 
     title: str
     calibrators: Sequence[str]
     worlds: Sequence[str]
+    fields: Mapping[str, Mapping[str, Any]]
     refusals: Sequence[Sequence[str]]
     notes: Sequence[str]
     wedge_buffer: float
@@ -125,7 +129,7 @@ class Comparison(Task, stage="comparison", version=7):
         """Write comparison.csv, comparison.json and comparison.md."""
         cases = read_cases(self.calibrators, self.worlds, self.cases)
         less = {world: self.differences(world, found) for world, found in cases.items()}
-        Table.of_records(list(_csv_rows(cases))).write_csv(output / CSV)
+        Table.of_records(list(_csv_rows(cases, self.fields))).write_csv(output / CSV)
         summaries = {
             world: {name: {**case.summary, "differences": less[world][name]} for name, case in found.items()}
             for world, found in cases.items()
@@ -177,7 +181,10 @@ class Comparison(Task, stage="comparison", version=7):
         return Cost(2 + cases * (0.1 + held * 2e-9), LIBRARIES_MEMORY + held, 1e6)
 
 
-def _csv_rows(cases: Mapping[str, Mapping[str, Case]]) -> Iterator[dict[str, Any]]:
+def _csv_rows(
+    cases: Mapping[str, Mapping[str, Case]], fields: Mapping[str, Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    changed = dict.fromkeys(field for values in fields.values() for field in values)
     for world, found in cases.items():
         for name, case in found.items():
             summary = case.summary
@@ -185,6 +192,8 @@ def _csv_rows(cases: Mapping[str, Mapping[str, Case]]) -> Iterator[dict[str, Any
                 yield {
                     "world": world,
                     "calibrator": name,
+                    **changed,
+                    **fields[world],
                     "k from [h/Mpc]": band["k"][0],
                     "k to [h/Mpc]": band["k"][1],
                     **{key.replace("_", " "): value for key, value in band.items() if key != "k"},
@@ -193,14 +202,10 @@ def _csv_rows(cases: Mapping[str, Mapping[str, Case]]) -> Iterator[dict[str, Any
                     "gain error aligned": summary["gain_error_aligned"],
                     "gain error as fitted": summary["gain_error_as_fitted"],
                     "chi squared of held-out data": summary["held_out_chi_squared"],
-                    "solves": _statuses(summary),
+                    "solves": statuses(summary),
                     "CPU seconds per integration": summary["cpu_seconds_per_integration"],
                     "peak memory [bytes]": summary["peak_memory"],
                 }
-
-
-def _statuses(summary: Mapping[str, Any]) -> str:
-    return ", ".join(f"{count} {status}" for status, count in summary["by_status"].items())
 
 
 def _markdown(
@@ -314,7 +319,7 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
                 _percent(summary["gain_error_aligned"]),
                 _percent(summary["gain_error_as_fitted"]),
                 _cell(summary["held_out_chi_squared"], decimals=3),
-                _statuses(summary),
+                statuses(summary),
                 *_cost_cells(summary),
             )
         )

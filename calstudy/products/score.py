@@ -18,7 +18,6 @@ from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.score import BANDS, SPECTRA, CalibratedSpectra, Score
 from calstudy.power.score import score as measure
-from calstudy.power.spectra import of_common_units
 from calstudy.power.tables import save_spectrum
 from calstudy.products import calibration, corruption, expected_loss, signal_loss, sky_model, spectra
 from calstudy.products.corruption import PARITIES
@@ -102,8 +101,7 @@ class MeasureScore(Task, stage="score", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the scores, and all numbers to score.json."""
-        delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SPECTRA}
-        measured = CalibratedSpectra(**of_common_units(delays))
+        measured = signal_loss.read_calibrated({name: getattr(self, name) for name in SPECTRA})
         known = read_json(self.scale / signal_loss.SCALE)["flux_scale"]
         scale, power = math.nan if known is None else known, self.power
         save_spectrum(output / SCORE_BINS, measure(measured, make_bin_edges(power.bins), power.wedge_buffer, scale))

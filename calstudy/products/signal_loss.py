@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.files import json_number
-from calstudy.base.resources import Cost
+from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.delay import make_taper
+from calstudy.power.score import SPECTRA, CalibratedSpectra
+from calstudy.power.score import score as measure
 from calstudy.power.spectra import SphericalSpectrum, of_common_units
 from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_csv
 from calstudy.power.transfer import (
@@ -35,6 +37,7 @@ from calstudy.products import calibration, corruption, spectra
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     AVERAGE,
+    SCORE,
     TRANSFER,
     TRANSFER_BANDS,
     read_json,
@@ -135,6 +138,17 @@ class Difference(Task, stage="difference", version=2):
         return Cost(0.1 * blocks, disk=blocks * size_of(self).baselines * 1e4)
 
 
+def read_calibrated(folders: Mapping[str, Path]) -> CalibratedSpectra:
+    """Read the delay spectra of a calibration, in common units, from the folders of each."""
+    delays = {name: spectra.read_delay_spectra(folders[name]) for name in SPECTRA}
+    return CalibratedSpectra(**of_common_units(delays))
+
+
+def statuses(summary: Mapping[str, Any]) -> str:
+    """Count the solves by status in words, from the content of score.json."""
+    return ", ".join(f"{count} {status}" for status, count in summary["by_status"].items())
+
+
 class Injected(Task):
     """The power of a signal and of the response to it, and the spectra of the residual."""
 
@@ -212,24 +226,39 @@ def write_transfer(
     return summary
 
 
-class SweepSummary(Task, stage="sweep-summary", version=1, cost=Cost(1, disk=1e5)):
-    """T of all points of a sweep, which have their label and what was changed as text."""
+class SweepSummary(Task, stage="sweep-summary", version=2):
+    """T, bias and solves of all points of a sweep, which have by label the values of the varied fields.
 
-    points: Sequence[Mapping[str, Any]]
-    transfers: Inputs
+    The wedge buffers are in `points` as well. `measured` has T of each by label, and as ``label:name`` its score, and
+    the spectra of that.
+    """
+
+    points: Mapping[str, Mapping[str, Any]]
+    measured: Inputs
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write summary.csv: a row for each point, region and band of k."""
-        rows: list[list[Any]] = []
-        for point in self.points:
-            changes = "; ".join(f"{field} = {text}" for field, text in point["changes"].items())
-            for region in REGIONS:
-                path = self.transfers[point["label"]] / spectrum_file(TRANSFER_BANDS, region)
+        """Write summary.csv: a row for each point, region and band of k; the bias is that outside the wedge."""
+        rows: list[dict[str, Any]] = []
+        for label, point in self.points.items():
+            solves = statuses(read_json(self.measured[f"{label}:score"] / SCORE))
+            for region, inside in REGIONS.items():
+                path = self.measured[label] / spectrum_file(TRANSFER_BANDS, region)
                 found = load_spectrum(path, TransferFunction)
-                columns = (values(found).tolist() for values in TRANSFER_COLUMNS.values())
-                rows += [[point["label"], changes, region, *row] for row in zip(*columns, strict=True)]
-        Table(("point", "changes", "region", *TRANSFER_COLUMNS), rows).write_csv(output / SUMMARY)
+                columns = {name: values(found) for name, values in TRANSFER_COLUMNS.items()}
+                if not inside:
+                    powers = read_calibrated({name: self.measured[f"{label}:{name}"] for name in SPECTRA})
+                    score = measure(powers, BANDS, point["wedge_buffer"], found.flux_scale)
+                    columns |= {"bias": score.bias, "bias error": score.bias_error}
+                first = {"point": label, **point["fields"], "region": region}
+                bands = zip(*(column.tolist() for column in columns.values()), strict=True)
+                rows += [{**first, **dict(zip(columns, row, strict=True)), "solves": solves} for row in bands]
+        Table.of_records(rows).write_csv(output / SUMMARY)
         return {}
+
+    def _cost(self) -> Cost:
+        size, points = size_of(self), len(self.points)
+        held = len(SPECTRA) * 3 * size.baselines * size.channels.count * COMPLEX128
+        return Cost(1 + points * (0.1 + held * 2e-9), LIBRARIES_MEMORY + held, 1e5)
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return T outside the wedge, a row for each point and a column for each band."""

@@ -148,8 +148,12 @@ class DataStudy(Study):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes of the calibrator on settings that will not work well."""
-        return self.solve_plan.notes
+        """Notes of the calibrator on settings that will not work well, and on integrations that are days apart."""
+        gaps = [np.diff(np.sort(facts.times)).max(initial=0.0) for facts in self.data.facts.values()]
+        if max(gaps) < 1:
+            return self.solve_plan.notes
+        note = f"observed.data: integrations are up to {max(gaps):.3g} days apart, and are treated as one run"
+        return (*self.solve_plan.notes, note)
 
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
         """Return the study fitted to a budget, and the number of workers.

@@ -19,6 +19,7 @@ from calstudy.power.interface import require_antennas
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
+from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.counts import expected_sources
 from calstudy.sky.settings import Eor, Foregrounds, SyntheticSources
 
@@ -31,6 +32,7 @@ SNAPSHOTS = 0.02
 def require_possible(experiment: Experiment) -> None:
     """Raise InputError if a beam or the EoR cannot be made, or an effect or the calibrator refuses the data."""
     require_beams(experiment.instrument)
+    _require_small_errors(experiment.instrument)
     _require_eor(experiment.sky.eor, experiment.instrument.channels.band)
     require_usable(experiment.corruption.effects, size_of_instrument(experiment.instrument))
     numbers = make_array(experiment.instrument).numbers
@@ -59,9 +61,19 @@ def require_beams(instrument: InstrumentSettings) -> None:
             model_of(beam).require_usable(instrument.channels)
 
 
+def _require_small_errors(instrument: InstrumentSettings) -> None:
+    """Raise InputError if antennas are scattered so far that neighbours may change places."""
+    scatter, shortest = instrument.as_built.positions.scatter, frame_of(instrument).lengths.min()
+    if scatter > shortest / 2 > 0:
+        raise InputError(
+            f"instrument.as_built.positions.scatter = {scatter:g} m: must be at most half of the shortest baseline of "
+            f"{shortest:.3g} m, for it is an error of the positions; give another instrument.layout for another array"
+        )
+
+
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    found = (_needless_limit(experiment), _long_average(experiment), _distant_box(experiment))
+    found = (_needless_limit(experiment), _average(experiment), _needless_chunks(experiment), _distant_box(experiment))
     return tuple(note for note in found if note)
 
 
@@ -74,15 +86,34 @@ def _needless_limit(experiment: Experiment) -> str:
     if None in kept or kept[0] != kept[1]:
         return ""
     return (
-        f"{FIELD}.{limit} = {str(assumed[limit])!r}: the same {kept[0]} brightest sources are kept as with the true "
-        "limit, for sky.foregrounds.count is reached before either; the sky model misses none of them"
+        f"{FIELD}.{limit} = {str(assumed[limit])!r}: assumes the sky that the data have, for none of its {kept[0]} "
+        "brightest sources (sky.foregrounds.count) is fainter; the sky model misses none of them"
     )
 
 
-def _long_average(experiment: Experiment) -> str:
-    times = experiment.instrument.times
+def _require_another_sky(experiment: Experiment) -> None:
+    """Raise InputError if all that is assumed is a flux limit, and no source is below it."""
+    needless = _needless_limit(experiment)
+    if needless and len(assumed_changes(experiment.calibration.assumed)) == 1:
+        raise InputError(f"{needless}; give a higher limit, or a smaller {FIELD}.sky.foregrounds.count")
+
+
+def _needless_chunks(experiment: Experiment) -> str:
+    chunks, channels = experiment.simulation.chunks, experiment.instrument.channels.count
+    if chunks <= max(channels, SimulationSettings().chunks):
+        return ""
+    return f"simulation.chunks = {chunks}: the EoR is simulated in {channels} parts, for there are no more channels"
+
+
+def _average(experiment: Experiment) -> str:
+    times, coherent_time = experiment.instrument.times, experiment.power.coherent_time
     minutes = times.count * times.integration / 60
-    if experiment.power.coherent_time is not None or minutes <= LONG_AVERAGE:
+    if coherent_time is not None and coherent_time < times.integration:
+        return (
+            f"power.coherent_time = {coherent_time:g} s: is shorter than an integration of {times.integration:g} s, so "
+            "that each integration is a block of its own"
+        )
+    if coherent_time is not None or minutes <= LONG_AVERAGE:
         return ""
     return (
         f"power.coherent_time = null: all {minutes:.0f} min are averaged coherently. A sky that drifts through the "
@@ -120,6 +151,7 @@ def require_calibration(experiment: Experiment) -> None:
     if any(variant.calibrate for variant in experiment.variants.values()):
         world = assumed_world(experiment)
         require_beams(world.instrument)
+        _require_another_sky(experiment)
         _require_calibrators(experiment)
         places = [(instrument.layout, instrument.site) for instrument in (experiment.instrument, world.instrument)]
         if places[0] != places[1]:

@@ -312,6 +312,15 @@ def test_a_dry_run_says_how_many_antennas_have_no_gains_to_start_from(command, d
     assert "The gains of 2 of 8 antennas are flagged; these start from unity." in told
 
 
+def test_a_dry_run_says_that_integrations_are_days_apart(command, data):
+    assert "days apart" not in command(data, *OPTIONS, "--dry-run")[1]
+    uvd = UVData.from_file(str(data))
+    uvd.time_array[uvd.time_array > uvd.time_array.min()] += 3
+    uvd.set_lsts_from_time_array()
+    uvd.write_uvh5(str(data), clobber=True)
+    assert "integrations are up to 3 days apart" in command(data, *OPTIONS, "--dry-run")[1]
+
+
 def test_a_dry_run_says_where_no_sample_has_a_weight(command, tmp_path):
     uvd = make_uvdata(make_toy(scattered(5), autos=True), 1)
     autos = uvd.ant_1_array == uvd.ant_2_array

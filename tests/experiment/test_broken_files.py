@@ -226,19 +226,79 @@ def test_more_memory_than_the_machine_has_is_noted_in_a_plan(tmp_path, capsys, m
     assert "is more than" not in planned(capsys)
 
 
+def refused(capsys, *options: str) -> str:
+    """Return why ``calstudy plan file.yaml`` refuses."""
+    status, message = run_command(capsys, "plan", "file.yaml", *options)
+    assert status == REFUSED
+    return " ".join(message.split())
+
+
 def planned(capsys, *options: str) -> str:
     """Return what ``calstudy plan file.yaml`` writes to standard output."""
     cli.app(["plan", "file.yaml", *options], standalone_mode=False)
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("limit", "noted"), [("10 mJy", True), ("20 Jy", False)])
-def test_a_catalogue_that_is_assumed_and_misses_nothing_is_noted_in_a_plan(limit, noted, tmp_path, capsys, monkeypatch):
+def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The 100 brightest sources are brighter than 10 Jy.
-    data = {**tiny(tmp_path), "calibration": {"assumed": {"sky.foregrounds.flux_limit": limit}}}
+    assumed = {"sky.foregrounds.flux_limit": "2 Jy"}
+    Path("file.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "calibration": {"assumed": assumed}}))
+    planned(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 20 Jy}")
+    assert "flux_limit = '2.0 Jy': assumes the sky that the data have" in refused(capsys)
+    # Where the sky model is wrong otherwise, it is noted.
+    errors = "sky.foregrounds.errors.flux_scale: 1.1"
+    told = planned(capsys, "--set", f"calibration.assumed={{sky.foregrounds.flux_limit: 2 Jy, {errors}}}")
+    assert "the sky model misses none of them" in " ".join(told.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("power.coherent_time=1 s", "is shorter than an integration of"),
+        ("simulation.chunks=50", "simulation.chunks = 50: the EoR is simulated in"),
+    ],
+)
+def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    assert told not in " ".join(planned(capsys).split())
+    assert told in " ".join(planned(capsys, "--set", change, "--set", "instrument.times.integration=10 s").split())
+
+
+def test_a_run_shows_the_notes_of_its_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    for name in ("study.run_study", "show.show_run"):
+        monkeypatch.setattr(f"calstudy.studies.{name}", lambda *_: None)
+    cli.app(["run", "file.yaml", "--set", "simulation.chunks=50"], standalone_mode=False)
+    assert "note: simulation.chunks = 50" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("instrument.as_built.positions.scatter=50 m", "must be at most half of the shortest baseline"),
+        ("corruption.effects=[{kind: reflection-gains, delay: 1 s}]", "corruption.effects.0.delay: 1 s must be"),
+        ("outputs={store: x, runs: ./x}", "outputs.runs: 'x' is also outputs.store"),
+    ],
+)
+def test_settings_that_can_only_be_mistakes_are_refused(change, told, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    assert told in refused(capsys, "--set", change)
+
+
+def test_a_world_that_changes_nothing_is_refused_and_notes_of_cases_are_shown(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    world = {"calibration.assumed.sky.foregrounds.flux_limit": "2 Jy"}
+    base = {key: value for key, value in tiny(tmp_path).items() if key not in ("calibration", "outputs", "variants")}
+    data = {"name": "x", "experiment": base, "calibrators": {"mine": "sky-based"}, "worlds": {"ideal": {}, "a": world}}
     Path("file.yaml").write_text(yaml.safe_dump(data))
-    assert ("the sky model misses none of them" in " ".join(planned(capsys).split())) is noted
+    assert "mine in a: calibration.assumed.sky.foregrounds.flux_limit" in refused(capsys)
+    limits = "worlds={ideal: {}, a: {calibration.assumed.sky.foregrounds.flux_limit: 20 Jy}}"
+    told = planned(capsys, "--set", limits, "--set", "simulation.chunks=50")
+    assert told.count("simulation.chunks = 50") == 1
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """The report: complete, self-contained, and safe whatever a run is called."""
 
 import base64
-import csv
 import dataclasses
 import html.parser
 import json
@@ -14,7 +13,7 @@ import pytest
 from report_content import CLAIM, MANIFEST, PNG, product
 
 from calstudy.base.errors import InputError
-from calstudy.base.table import to_json
+from calstudy.base.table import Table, to_json
 from calstudy.power.settings import PowerSettings
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
@@ -171,23 +170,23 @@ def test_tables_of_products_are_in_the_page_as_they_were_written(folder):
     assert rows(folder, "Signal loss") == list(shown[0].rows)
 
 
-def test_the_summary_of_a_sweep_has_a_row_per_point(tmp_path):
-    inputs = {}
-    for point, value in (("01-a", 0.5), ("02-b", 0.25)):
-        inputs[point] = tmp_path / point
-        inputs[point].mkdir()
-        scale = 1.1 if point == "01-a" else float("nan")
-        save_transfer(inputs[point] / "transfer-bands.outside-wedge.h5", [value, 0.75], scale)
-        save_transfer(inputs[point] / "transfer-bands.inside-wedge.h5", [0.1, 0.1])
-    points = [{"label": point, "changes": {"x": "1"}} for point in inputs]
-    summary = SweepSummary("all points", points=points, transfers=inputs)
-    summary.make(tmp_path)
-    with (tmp_path / "summary.csv").open(newline="") as file:
-        found = list(csv.DictReader(file))
-    assert [row["changes"] for row in found] == ["x = 1"] * 8
-    (table,) = summary.shown(tmp_path)
+def test_the_summary_of_a_sweep_is_shown_with_a_row_per_point(tmp_path):
+    rows = [
+        {
+            "point": point,
+            "region": region,
+            **dict(zip(("k from [h/Mpc]", "k to [h/Mpc]"), band, strict=True)),
+            **{"transfer": value, "transfer error": 0.01},
+            **{f"transfer without flux scale{column}": free for column in ("", " error")},
+        }
+        for point, values, free in (("01-a", (0.5, 0.75), float("nan")), ("02-b", (0.25, 0.75), 0.1))
+        for region in ("outside-wedge", "inside-wedge")
+        for value, band in zip(values, ((0.1, 0.2), (0.2, 0.3)), strict=True)
+    ]
+    Table.of_records(rows).write_csv(tmp_path / "summary.csv")
+    (table,) = SweepSummary("all points", points={}, measured={}).shown(tmp_path)
     assert table.columns == ("point", "k = 0.1 to 0.2 h/Mpc", "k = 0.2 to 0.3 h/Mpc")
-    assert table.rows == [("01-a", "0.500 ± 0.010", "0.750 ± 0.010"), ("02-b", "0.250 ± 0.010", "0.750 ± 0.010")]
+    assert table.rows == [("01-a", "0.500 ± 0.010", "0.750 ± 0.010"), ("02-b", "0.100 ± 0.100", "0.100 ± 0.100")]
 
 
 def test_a_sweep_and_a_collection_lead_to_the_reports_of_their_parts(folder):

@@ -138,6 +138,9 @@ def test_tables_and_figures_hold_every_case(compared):
     assert cases == {(world, name) for world in WORLDS for name in CALIBRATORS}
     assert len(rows) == len(cases) * (len(BANDS) - 1)
     assert all(float(row["CPU seconds per integration"]) > 0 for row in rows)
+    # What a world changes has a column, which is empty for the others.
+    scatter = {(row["world"], row["calibration.assumed.sky.foregrounds.errors.flux_scatter"]) for row in rows}
+    assert scatter == set(zip(WORLDS, ("", "0.2"), strict=True))
     text = (folder / "tables" / "comparison.md").read_text()
     assert all(f"| {name} |" in text for name in CALIBRATORS)
     for figure in FIGURES:

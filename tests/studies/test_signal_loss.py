@@ -145,6 +145,20 @@ def test_a_sweep_leaves_a_summary_a_figure_and_a_folder_per_point(swept):
     assert len(rows) == 5 * 2 * 4
     first = table(swept, 1, "transfer-bands.outside-wedge")
     assert float(rows[3]["transfer"]) == pytest.approx(first.transfer[3])
+    # A column for each field, also of points of other blocks, in SI units.
+    fields = [(row["calibration.basis.buffer"], row["sky.eor.seed"], row["corruption.eor_level"]) for row in rows[::8]]
+    assert [float(buffer) for buffer, *_ in fields[:4]] == pytest.approx([50e-9, 50e-9, 400e-9, 400e-9])
+    assert [seed for _, seed, _ in fields[:4]] == ["2", "3", "2", "3"]
+    assert fields[4][2] not in {level for *_, level in fields[:4]}
+    outside = [row for row in rows if row["region"] == "outside-wedge"]
+    assert all(float(row["bias error"]) > 0 for row in outside if float(row["k from [h/Mpc]"]) >= 0.2)
+    assert {row["bias"] for row in rows if row["region"] == "inside-wedge"} == {""}
+    # Above k = 0.5 h/Mpc the bands are those of the score.
+    bands = json.loads((folder / "points" / names[0] / "tables" / "score.json").read_text())["bands"]
+    assert [float(rows[3][name]) for name in ("bias", "bias error")] == pytest.approx(
+        [bands[-1]["bias"], bands[-1]["bias_error"]]
+    )
+    assert all(sum(int(count.split()[0]) for count in row["solves"].split(", ")) == 8 for row in rows)
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["points"][2]["changes"] == {"calibration.basis.buffer": "400 ns", "sky.eor.seed": "2"}
     assert (folder / "points" / names[0] / "manifest.json").exists()

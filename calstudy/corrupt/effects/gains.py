@@ -135,7 +135,13 @@ class ReflectionGains(GainEffect):
     seed: int = Field(5, ge=0, description="Seed of r, tau and phi.")
 
     def refusal(self, size: Size) -> str | None:
-        """Refuse changes of antennas that do not exist."""
+        """Refuse antennas that do not exist, and delays with which a reflection averages out within a channel."""
+        longest = 1 / size.channels.width if size.channels.width else np.inf
+        if abs(self.delay) > longest:
+            return (
+                f"delay: {self.delay:g} s must be at most {longest:.3g} s, one over the width of a channel, in which "
+                "later reflections average out"
+            )
         reason = None if self.swing is None else refusal_of_antennas(self.swing.antennas, size.antennas)
         return super().refusal(size) if reason is None else f"swing.antennas: {reason}"
 

@@ -43,7 +43,7 @@ from calstudy.products.score import MeasureScore, score
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.folder import EXPERIMENT
-from calstudy.studies.kinds.experiment import ExperimentStudy, Family, study_of, what_is_made
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, fields_of, study_of, what_is_made
 from calstudy.studies.preflight import refusal_of_calibrator
 from calstudy.studies.study import KINDS, kind_of
 
@@ -317,7 +317,10 @@ class Comparison(Family):
     @cached_property
     def tables(self) -> list[Task]:
         """The table of all cases."""
-        return [comparison(self.name, self._labels, self.scores, self.stand_ins)]
+        firsts = [case_name(row, 0) for row in range(len(self.file.worlds))]
+        changed = zip(self.resolved["worlds"].items(), firsts, strict=True)
+        fields = {world: fields_of(self.members[first], [changes]) for (world, changes), first in changed}
+        return [comparison(self.name, {**self._labels, "fields": fields}, self.scores, self.stand_ins)]
 
     @cached_property
     def figures(self) -> list[Task]:

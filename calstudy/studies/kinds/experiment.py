@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
+from pydantic import BaseModel
+
 from calstudy.base.errors import InputError
 from calstudy.base.identity import identity
+from calstudy.base.paths import leaves, value_at
 from calstudy.base.table import Table
 from calstudy.claims.evaluation import Evaluated, claims
 from calstudy.claims.paper import stand_ins, unique_notes
 from calstudy.corrupt.noise import NoiseRelativeToEor, NoiseRelativeToForegrounds, NoNoise, RadiometerNoise
+from calstudy.experiment.assumed import assumed_world
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import Experiment, Folders
 from calstudy.figures import StudyFigure, figure_task, figures_for
@@ -184,6 +189,11 @@ class Family(Study):
         return self.studies
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the members, once each."""
+        return tuple(dict.fromkeys(note for study in self.studies.values() for note in study.notes))
+
+    @property
     def outputs(self) -> Folders:
         """Store and folder of runs."""
         return next(iter(self.members.values())).outputs
@@ -246,6 +256,31 @@ def study_of(experiment: Experiment, folder: Path = Path()) -> Study:
     """
     special = KINDS.marked("key", [name for name, value in experiment if value])
     return (special[0] if special else ExperimentStudy).of(experiment, folder)
+
+
+def text_of(value: Any) -> str:
+    """Write a value of a field for people: text unchanged, the names of files, blocks as ``key value``."""
+    if isinstance(value, BaseModel):
+        value = value.model_dump(mode="json")
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {text_of(item)}" for key, item in value.items())
+    if isinstance(value, str | Path):
+        return Path(value).name if str(value).startswith("/") else str(value)
+    return json.dumps(value, default=text_of)
+
+
+def fields_of(experiment: Experiment, changes: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return an experiment's own values of all fields that are changed: SI numbers, or text; None if it has none."""
+    paths = [path for change in changes for path, _ in leaves(change, whole=lambda block: "kind" in block)]
+    assumed = {**experiment.calibration.assumed, **dict(assumed_world(experiment))}
+    content = {**dict(experiment), "calibration": {**dict(experiment.calibration), "assumed": assumed}}
+    found = {}
+    for path in paths:
+        value: Any = content
+        for step in path.split("."):
+            value = value_at(dict(value) if isinstance(value, BaseModel) else value, step)
+        found[path] = value if value is None or type(value) in (int, float) else text_of(value)
+    return found
 
 
 def describe_setup(experiment: Experiment) -> str:

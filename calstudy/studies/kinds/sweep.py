@@ -18,10 +18,12 @@ from calstudy.base.identity import identity
 from calstudy.claims.paper import stand_ins
 from calstudy.experiment.files import StudyFile, overridden, short_names, validate, with_absolute_paths
 from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
+from calstudy.power.score import SPECTRA
 from calstudy.products.graph import required
+from calstudy.products.score import score
 from calstudy.products.signal_loss import SweepSummary, transfer
 from calstudy.run.task import Task
-from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of, what_is_made
+from calstudy.studies.kinds.experiment import ExperimentStudy, Family, content_of, fields_of, text_of, what_is_made
 
 SWEPT = ("instrument", "sky", "simulation", "corruption", "calibration", "power", "variants")
 """Sections whose fields can be varied."""
@@ -99,10 +101,16 @@ class Sweep(Family):
 
     @cached_property
     def tables(self) -> list[Task]:
-        """The signal loss of all points."""
-        points = [{"label": point.label, "changes": dict(point.changes)} for point in self.points]
-        transfers = {label: required(transfer(study.graph)) for label, study in self.studies.items()}
-        return [SweepSummary("signal loss of all points", points=points, transfers=transfers)]
+        """The signal loss and the bias of all points."""
+        changes = [{path: item} for block in self.file.sweep for path, values in block.items() for item in values]
+        points: dict[str, Any] = {}
+        inputs: dict[str, Task] = {}
+        for label, study in self.studies.items():
+            experiment, measured = study.experiment, required(score(study.graph))
+            points[label] = {"fields": fields_of(experiment, changes), "wedge_buffer": experiment.power.wedge_buffer}
+            inputs |= {label: required(transfer(study.graph)), f"{label}:score": measured}
+            inputs |= {f"{label}:{name}": measured.inputs[name] for name in SPECTRA}
+        return [SweepSummary("signal loss of all points", points=points, measured=inputs)]
 
     @property
     def entries(self) -> Mapping[str, Any]:
@@ -201,15 +209,6 @@ def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str, fo
     data = overridden(plain, changes)
     data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
     return validate(data, folder)
-
-
-def text_of(value: Any) -> str:
-    """Write a value of a sweep for people: text unchanged, the names of files, blocks as ``key value``."""
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {text_of(item)}" for key, item in value.items())
-    if isinstance(value, str):
-        return Path(value).name if value.startswith("/") else value
-    return json.dumps(value)
 
 
 def varied_fields(block: Mapping[str, Sequence[Any]]) -> list[str]:
