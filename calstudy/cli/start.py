@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 
@@ -125,11 +125,12 @@ def _described(data: str) -> dict[str, str]:
         )
     frame, whole = facts.frame, _band(facts.frequencies[0], facts.frequencies[-1])
     vectors = frame.vectors[~frame.autos]
-    groups = redundant_groups(vectors, PowerSettings().redundancy_tolerance).index
+    groups = redundant_groups(vectors, PowerSettings().redundancy_tolerance).index.tolist()
+    redundant = sum(count for count in Counter(groups).values() if count > 1)
     return {
         "path": data if PLAIN_PATH.fullmatch(data) else json.dumps(data, ensure_ascii=False),
         "summary": f"{facts.antennas} antennas with baselines of up to {frame.lengths.max():.0f} m, "
-        f"{(np.bincount(groups)[groups] > 1).sum()} of {len(vectors)} with a redundant partner, "
+        f"{redundant} of {len(vectors)} with a redundant partner, "
         f"{facts.frequencies.size} channels of {whole}, {facts.times.size} integrations, in {facts.unit!r}.",
         "scale": "# " + SCALE if facts.unit.lower() == "jy" else SCALE,
         "autos": "" if facts.autos else "# ",
@@ -158,7 +159,7 @@ def _proposed(facts: Facts, whole: str, paths: tuple[Path, ...]) -> dict[str, st
     except InputError as error:
         raise InputError(f"--data: {error}") from None
     if lost := uncorrelated(data):
-        kept = np.setdiff1d(facts.frame.numbers, lost)
+        kept = [number for number in facts.frame.numbers.tolist() if number not in lost]
         antennas = (
             f"# All but {', '.join(map(str, lost))}, whose cross-correlations are zero, flagged or noise; without this "
             f"line: all.\n    antennas: {','.join(map(str, kept))}"

@@ -229,5 +229,5 @@ def test_bad_data_are_refused_in_one_sentence(toy, data):
         run_calibrator(SETTINGS.model_copy(update={"autos": True}), data)
     crossed = data.copy()
     crossed.polarization_array = np.array([-7])
-    with pytest.raises(ValueError, match="polarizations: en; calibration takes xx, yy"):
+    with pytest.raises(ValueError, match="polarizations: xy; calibration takes xx, yy"):
         run_calibrator(SETTINGS, crossed)

@@ -204,7 +204,7 @@ def test_an_array_that_cannot_be_made_is_not_a_refusal_of_calibrators(tmp_path):
     (tmp_path / "positions.csv").write_text("number,east_m,north_m\n1,0,0\n2,14,0\n")
     layout = {"kind": "csv", "path": "positions.csv"}
     worlds = {"mine": {"instrument.layout": layout, "instrument.location": "mwa"}}
-    with pytest.raises(InputError, match=r"^instrument\.layout\.path: .*missing: up_m$"):
+    with pytest.raises(InputError, match=r"^instrument\.layout\.path: .*missing: up_m;"):
         load_study(comparison_file(tmp_path, worlds=worlds))
 
 
