@@ -37,9 +37,9 @@ INTERFERENCE = (
     "interference? (--flag-interference, observed.flag_interference: true; if it is on, select a quieter band)"
 )
 BRIGHT = 2.0
-"""Data of a channel over those of the others from which on they tell interference; gains may be high by noise alone."""
+"""Data of a channel over those of the median one, above which its high gains are ascribed to interference."""
 NOISE = (
-    "the data are not: noise? (solve more integrations together, integrations_per_solve, or smooth the gains, "
+    "its data are as elsewhere: noise? (solve more integrations together, integrations_per_solve, or smooth the gains, "
     "smooth_gains)"
 )
 NAMED = 6

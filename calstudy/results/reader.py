@@ -377,9 +377,14 @@ class RunFolder:
         path = self.path / "tables" / COMPARISON
         if not path.is_file():
             return {}
-        # Verdicts need all that is read of it.
-        _undamaged(path, lambda file: standings(read_json(file)), "run the comparison again")
-        return read_json(path)
+
+        def read(file: Path) -> dict[str, Any]:
+            scores = read_json(file)
+            # Verdicts need all that is read of it.
+            standings(scores)
+            return scores
+
+        return _undamaged(path, read, "run the comparison again")
 
     @property
     def has_claims(self) -> bool:

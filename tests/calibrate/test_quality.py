@@ -98,7 +98,7 @@ def test_gains_that_stand_out_are_named(clean):
     gains[ANTENNA] *= 0.1
     loud = clean.copy()
     loud.data_array[:, CHANNEL] *= 50
-    for data, question in ((loud, "interference? (--flag-interference"), (clean, "the data are not: noise?")):
+    for data, question in ((loud, "interference? (--flag-interference"), (clean, "its data are as elsewhere: noise?")):
         told = assess(data, result_of(data, normal(data), gains)).warnings
         assert len(told) == 2
         assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); {question}" in told[0]
