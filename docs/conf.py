@@ -46,6 +46,9 @@ exclude_patterns = ["docs/api/modules.rst"]
 
 html_theme = "furo"
 html_title = "calstudy"
+html_static_path = ["static"]
+html_css_files = ["dark.css"]
+html_search_scorer = "static/search.js"
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
