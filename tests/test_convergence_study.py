@@ -85,7 +85,11 @@ def test_gains_of_two_integrations_together_are_expected_to_take_half(figures, t
     assert taken[1] == pytest.approx(taken[0] / 2, rel=0.2)
 
 
-def test_a_loss_of_smoothed_gains_is_not_expected(tmp_path):
-    study = expecting(tmp_path, smooth_gains={"kind": "polynomial", "frequency_degree": 2})
-    with pytest.raises(InputError, match=r"'expected-loss': needs a fit without calibration\.smooth_gains"):
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("smooth_gains", {"kind": "polynomial", "frequency_degree": 2}), ("baselines", {"shortest": "30 m"})],
+)
+def test_a_loss_of_smoothed_gains_or_of_a_range_of_baselines_is_not_expected(field, value, tmp_path):
+    study = expecting(tmp_path, calibrator="sky-based", **{field: value})
+    with pytest.raises(InputError, match=rf"'expected-loss': needs a fit without calibration\.{field}"):
         _ = study.figures

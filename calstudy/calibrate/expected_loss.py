@@ -259,15 +259,19 @@ class GainResponse:
         left = self._kernels.left_of(self._equations, loaded, self._tolerance, CG_ITERATIONS)
         return tensors.unload(left, unit * self._total)
 
-    def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
-        """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""
+    def change(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
+        """Return the relative change of g_a g_b* that W y causes, (Nbls, Nfreqs)."""
         first, second = self._antennas
         gradient = tangent.slope.conj() * left
         descent = np.zeros(self._shape, complex)
         np.add.at(descent, first, gradient)
         np.add.at(descent, second, gradient.conj())
         eta = self.solve(descent)
-        return tangent.without_foregrounds(tangent.slope * (eta[first] + eta[second].conj()))
+        return eta[first] + eta[second].conj()
+
+    def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
+        """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""
+        return tangent.without_foregrounds(tangent.slope * self.change(tangent, left))
 
 
 def linear_response(
@@ -290,10 +294,13 @@ def linear_response(
 
     Returns
     -------
-    Complex, (Nbls, Nfreqs); zero for samples without weight.
+    Complex, (Nbls, Nfreqs). It is zero for samples without weight where foregrounds are fitted. Where they are the sky
+    model, the residual has these samples too.
     """
     tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
     left = tangent.without_foregrounds(tangent.roots * signal)
+    if problem.frozen:
+        return signal - model * response.change(tangent, left)
     left = left - response.absorbed(tangent, left)
     return np.divide(left, tangent.roots, out=np.zeros(left.shape, complex), where=tangent.roots > 0)
 

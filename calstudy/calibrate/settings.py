@@ -375,6 +375,11 @@ class GainFit(WeightedFit):
         """Whether a deviation of the foregrounds' prior is estimated from the data."""
         return False
 
+    @property
+    def unexpected(self) -> str | None:
+        """Field whose effect on the residual the expected loss of the fit lacks; None: there is none."""
+        return next((name for name in ("smooth_gains", "baselines") if getattr(self, name) is not None), None)
+
 
 ScalePrior = Annotated[
     Literal["sum", "post-hoc", "gains", "sky-model", "none"],

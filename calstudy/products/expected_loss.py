@@ -59,11 +59,12 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 
 @memoize
 def expected_loss(graph: Graph) -> Task:
-    """Return the task that predicts T for the middle integration; raises InputError if gains are smoothed."""
-    if graph.experiment.calibration.smooth_gains is not None:
+    """Return the task that predicts T for the middle integration; raises InputError if it would be another."""
+    fit = graph.experiment.calibration
+    if isinstance(fit, GainFit) and (field := fit.unexpected):
         raise InputError(
-            "figure 'expected-loss': needs a fit without calibration.smooth_gains, for the expected loss is that of "
-            "the gains as fitted; leave out one of the two"
+            f"figure 'expected-loss': needs a fit without calibration.{field}, whose effect on the residual the "
+            "expected loss lacks; leave out one of the two"
         )
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
     return ExpectedLoss(LABEL, probes=PROBES, power=power, **solved_inputs(graph))
@@ -117,12 +118,14 @@ def solved_inputs(graph: Graph, parity: str = "even") -> dict[str, Any]:
 class _Solution:
     """The problem of one solve and its solution: gains (Nants, Nfreqs), model (Ntimes Nbls, Nfreqs), pairs (Nbls, 2).
 
-    `vectors` are those of the baselines, m, (Nbls, 3). A solve has one integration, or several together.
+    `used` are the samples that are not flagged, like the model, and `vectors` those of the baselines, m, (Nbls, 3). A
+    solve has one integration, or several together.
     """
 
     problem: CalibrationProblem
     gains: np.ndarray
     model: np.ndarray
+    used: np.ndarray
     pairs: np.ndarray
     vectors: np.ndarray
     frequency: np.ndarray
@@ -170,6 +173,7 @@ class Solved(Calibrated):
             problem,
             gains,
             to_cube(model)[..., 0].reshape(problem.visibilities.shape),
+            prepared.used[..., 0].reshape(problem.visibilities.shape),
             antenna_pairs(model),
             prepared.data.vectors,
             np.asarray(data.freq_array, float),
@@ -210,8 +214,11 @@ class ExpectedLoss(Solved, stage="expected-loss", version=5):
         return cost_of_responses(self, self.probes, 1.5e9)
 
 
-class Response(Solved, stage="response", version=1):
-    """The linear response of one calibrated integration to a signal."""
+class Response(Solved, stage="response", version=2):
+    """The linear response of one calibrated integration to a signal.
+
+    Since version 2 baselines without weight have one, and flagged samples no signal.
+    """
 
     signal: Input
 
@@ -223,8 +230,8 @@ class Response(Solved, stage="response", version=1):
         solution, arrays = self.solution(), {}
         if solution is not None:
             eor = read_visibilities(self.signal / DATA, self.times)
-            signal = to_cube(eor)[0, rows_of(eor, solution.pairs), :, 0]
-            left = response_to(solution.problem, solution.gains, solution.model, signal)
+            signal = solution.used * to_cube(eor)[0, rows_of(eor, solution.pairs), :, 0]
+            left = response_to(solution.problem, solution.gains, solution.model, signal) * solution.used
             modes = DelayModes(solution.frequency, self.power.taper)
             arrays = {
                 **solution.axes(modes),

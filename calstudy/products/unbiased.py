@@ -61,8 +61,11 @@ def unbiased(graph: Graph) -> Task:
     return Unbiased("spectrum without loss", power=power, even=even, odd=odd, spectra=spectra(graph), scale=scale)
 
 
-class BinResponse(Solved, stage="bin-response", version=1):
-    """The linear response of one calibrated integration to random signals of each bin of k."""
+class BinResponse(Solved, stage="bin-response", version=2):
+    """The linear response of one calibrated integration to random signals of each bin of k.
+
+    Since version 2 baselines without weight have one, where the foregrounds are the sky model.
+    """
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the amplitudes of what is left of the signals; none if there are no gains."""
@@ -76,10 +79,11 @@ class BinResponse(Solved, stage="bin-response", version=1):
             signals = BinSignals(*where, window_edges(self.power), self.power.cosmology)
             modes, rng = DelayModes(solution.frequency, self.power.taper), np.random.default_rng(SEED)
             fit = solution.problem, solution.gains, solution.model
-            drawn = [list(signals.draw(rng)) for _ in range(DRAWS)]
-            left = [[modes.amplitudes(response_to(*fit, signal)) for signal in parts] for parts in drawn]
-            used = solution.problem.weights > 0
-            powers = [np.abs(modes.amplitudes(used * signal)) ** 2 for parts in drawn for signal in parts]
+            drawn = [[solution.used * signal for signal in signals.draw(rng)] for _ in range(DRAWS)]
+            left = [
+                [modes.amplitudes(solution.used * response_to(*fit, signal)) for signal in parts] for parts in drawn
+            ]
+            powers = [np.abs(modes.amplitudes(signal)) ** 2 for parts in drawn for signal in parts]
             arrays = {
                 **solution.axes(modes),
                 "left": np.array(left, np.complex64),

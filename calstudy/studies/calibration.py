@@ -192,13 +192,12 @@ class DataCalibration(DataStudy):
     def load(cls, file: StudyFile) -> DataCalibration:
         """Return the calibration of a file, with the metadata of its data."""
         content = read_file(CalibrationFile, file)
-        if content.expected_loss and not isinstance(content.calibration, GainFit):
-            label = content.calibration.label
-            raise InputError(f"expected_loss: is known for fits by least squares, and {label} is none")
-        if content.expected_loss and content.calibration.smooth_gains is not None:
+        fit = content.calibration
+        if content.expected_loss and not isinstance(fit, GainFit):
+            raise InputError(f"expected_loss: is known for fits by least squares, and {fit.label} is none")
+        if content.expected_loss and isinstance(fit, GainFit) and (field := fit.unexpected):
             raise InputError(
-                "expected_loss: is that of the gains as fitted, and calibration.smooth_gains changes them; leave out "
-                "one of the two"
+                f"expected_loss: lacks the effect of calibration.{field} on the residual; leave out one of the two"
             )
         facts = read_selected(content, content.observed.data, even=False)
         if {"hyperdrive", "mwaocal"} & set(content.also) and set(facts.polarizations) != LINEAR:

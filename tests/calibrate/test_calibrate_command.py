@@ -461,4 +461,4 @@ def test_the_loss_of_smoothed_gains_is_not_expected(command, data):
     smooth = ["--set", "smooth_gains.kind=polynomial", "--set", "smooth_gains.frequency_degree=2"]
     code, told = command(data, *OPTIONS, *smooth, "--expected-loss", "--dry-run")
     assert code == 2
-    assert "--expected-loss: is that of the gains as fitted, and calibration.smooth_gains changes them" in told
+    assert "--expected-loss: lacks the effect of calibration.smooth_gains on the residual" in told

@@ -220,6 +220,23 @@ def test_injected_signals_are_left_as_expected():
         assert ratio == pytest.approx(np.mean(expected[:, chosen]), abs=0.03)
 
 
+def test_linear_response_of_a_frozen_sky_has_the_baselines_that_gains_are_not_fitted_to():
+    problem, gains, model = case("any gains")
+    weights = problem.weights * (np.arange(len(model)) % 3 > 0)[:, None]
+    problem = replace(problem, sky_model=model, frozen=True, weights=weights)
+    signal = 1e-3 * complex_normal(np.random.default_rng(8), model.shape)
+    left = linear_response(problem, gains, model, signal)
+    data = gain_products(gains, problem.structure.antennas) * (model + signal)
+    measured = replace(problem, visibilities=data, prior="none", initial_gains=gains)
+    solution = solve_warm(measured, GaussNewton(tolerance=1e-6, max_steps=30), WarmStart(gains, None))[0]
+    found = data / gain_products(solution.gains, problem.structure.antennas) - model
+    for baselines in (np.ones(len(model), bool), weights.any(axis=1), ~weights.any(axis=1)):
+        difference, size = found[baselines] - left[baselines], left[baselines]
+        assert np.sqrt(np.mean(np.abs(difference) ** 2) / np.mean(np.abs(size) ** 2)) < 0.02
+    # Gains add what they fit elsewhere to the baselines without weight.
+    assert np.mean(np.abs(left[~weights.any(axis=1)]) ** 2) > np.mean(np.abs(signal) ** 2)
+
+
 @pytest.mark.parametrize("kind", ["any gains", "redundant", "frozen"])
 def test_linear_response_is_what_fits_of_data_with_a_signal_leave(kind):
     problem, gains, model = case("redundant" if kind == "redundant" else "any gains")
