@@ -231,6 +231,8 @@ def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_p
     assert changed.calibration.solver.max_steps == 7 != other.calibration.solver.max_steps
     with pytest.raises(InputError, match=r"^--set figures\.0: set figures as a whole$"):
         load_study(path, overrides=["figures.0=comparison-matrix"])
+    with pytest.raises(InputError, match=r"^--set experiment: experiment can only be changed in the file; .*, worlds"):
+        load_study(path, overrides=["experiment=other.yaml"])
     with pytest.raises(ExperimentError, match=r"sky\.eor\.sed"):
         load_study(comparison_file(tmp_path), overrides=["worlds={ideal: {sky.eor.sed: 9}}"])
 
@@ -411,7 +413,10 @@ def test_two_calibrators_that_are_the_same_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"overrides": {"instrument.banana": 3}}, r"scales\.small: instrument\.banana: unknown key.*in 'sky-based in ideal' and 7 other"),
+        (
+            {"overrides": {"instrument.banana": 3}},
+            r"scales\.small: instrument\.banana: unknown key.*in 'sky-based in ideal' and 7 other",
+        ),
         ({"worlds.ideal": {"sky.eor.sed": 3}}, r"scales\.small: sky\.eor\.sed: unknown key"),
         ({"calibrators.none": "nobody"}, r"scales\.small: calibration\.calibrator: 'nobody' is not a calibrator"),
         ({"figurs": []}, r"scales\.small: figurs: unknown key, did you mean 'figures'"),

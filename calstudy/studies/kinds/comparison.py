@@ -53,8 +53,6 @@ LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it, but for `calibration.assumed`."""
 CALIBRATOR = f"calibration.{CALIBRATORS.tag}"
-OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
-"""Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
 WITHOUT_EFFECT = ("name", "description", "papers", "outputs.figures", "outputs.tables", *NOT_SHARED[1:])
 """Fields of an experiment that make nothing in a comparison, whose cases have scores alone."""
 VARIANTS_NEEDED = (
@@ -202,6 +200,7 @@ class Comparison(Family):
         "case."
     )
     subfolders = ("cases",)
+    settable = ("name", "description", "calibrators", "worlds", "figures", "salt")
 
     refusals: Mapping[str, str]
     resolved: Mapping[str, Any]
@@ -217,8 +216,8 @@ class Comparison(Family):
         ----------
         file
             Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
-            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
-            applied to the experiment of every case.
+            `settable` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others
+            are applied to the experiment of every case.
         calibrators : in place of those of the file
         """
         content, base, overrides, worlds = _read(file, calibrators)
@@ -511,8 +510,9 @@ def _read(
     own = file.scale if isinstance(scales, dict) and file.scale in scales else None
     data = apply_scale(file.content, own)
     changes = dict(parse_override(text) for text in file.overrides)
-    for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
+    for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in Comparison.settable]:
         data = _changed(data, dotted, changes.pop(dotted))
+    Comparison.require_fields(changes)
     if calibrators is not None:
         data[Comparison.key] = dict(calibrators)
     content = checked(ComparisonFile, data, file.folder)
