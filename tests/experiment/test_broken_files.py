@@ -257,6 +257,7 @@ def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, ca
     [
         ("power.coherent_time=1 s", "is shorter than an integration of"),
         ("simulation.chunks=50", "simulation.chunks = 50: the EoR is simulated in"),
+        ("sky.foregrounds.count=1000000000000", "keeps all, for only about "),
     ],
 )
 def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path, capsys, monkeypatch):

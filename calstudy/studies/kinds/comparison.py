@@ -216,8 +216,8 @@ class Comparison(Family):
         ----------
         file
             Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
-            `settable` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others
-            are applied to the experiment of every case.
+            `settable` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all
+            others are applied to the experiment of every case.
         calibrators : in place of those of the file
         """
         content, base, overrides, worlds = _read(file, calibrators)
