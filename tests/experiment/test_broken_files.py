@@ -239,6 +239,15 @@ def planned(capsys, *options: str) -> str:
     return capsys.readouterr().out
 
 
+def test_a_folder_that_is_a_file_is_named_as_it_was_given(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    status, message = run_command(capsys, "run", "file.yaml", "--output", "file.yaml")
+    assert status == REFUSED
+    assert message.startswith("calstudy: --output file.yaml: cannot be written (")
+    assert message.endswith("file.yaml is a file; a folder is needed)\n")
+
+
 def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The 100 brightest sources are brighter than 10 Jy.
