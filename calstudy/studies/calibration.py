@@ -24,7 +24,7 @@ from calstudy.base.gains import gain_products, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
-from calstudy.base.visibilities import antenna_pairs, flag_cube, polarization_names
+from calstudy.base.visibilities import antenna_pairs, flag_cube
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
@@ -351,11 +351,6 @@ class DataCalibration(DataStudy):
         section = self.file.observed
         tasks = (observed(self.graph, WHOLE), *self.tables)
         notes = [made.products[task.key].record["notes"] for task in tasks]
-        # pyuvdata names a polarization by the directions of its feeds; options have the names of the file.
-        names = {
-            f"{item['polarization']}: ": f"{polarization_names([number])}: "
-            for item, number in zip(found["quality"], self.data.facts[WHOLE].polarizations, strict=True)
-        }
         return {
             "calstudy": __version__,
             "data": [str(path) for path in section.data],
@@ -365,9 +360,7 @@ class DataCalibration(DataStudy):
             "flag_interference": section.flag_interference is not None,
             "settings": self.file.calibration.model_dump(mode="json"),
             "notes": notes[0]["changes"],
-            "warnings": [
-                names.get(text[:4], text[:4]) + text[4:] for note in notes for text in note.get("warnings", ())
-            ],
+            "warnings": [text for note in notes for text in note.get("warnings", ())],
             "plan": self.described(),
             "quality": found.pop("quality"),
             "chi_squared": found or None,
