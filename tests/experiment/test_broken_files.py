@@ -261,6 +261,21 @@ def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, ca
     assert "the sky model misses none of them" in " ".join(told.split())
 
 
+def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("sky.csv").write_text("ra,dec,s\n30,-27,9\n31,-26,5\n29,-28,3\n")
+    csv = {"right_ascension": "ra", "declination": "dec", "flux": "s", "frequency": "180 MHz"}
+    sky = {"foregrounds": {"kind": "file", "path": "sky.csv", "csv": csv}, "eor": tiny(tmp_path)["sky"]["eor"]}
+    assumed = {"sky.foregrounds.flux_limit": "4 Jy"}
+    Path("file.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "sky": sky, "calibration": {"assumed": assumed}}))
+    planned(capsys)
+    told = refused(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")
+    assert "for none of the 3 sources that it keeps" in told
+    # A catalogue that was changed is read again.
+    Path("sky.csv").write_text("ra,dec,s\n30,-27,9\n31,-26,5\n29,-28,3\n29,-29,1\n")
+    planned(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
