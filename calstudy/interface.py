@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, wraps
 from html import escape
 from io import StringIO
-from os import PathLike
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin
@@ -73,12 +72,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 Half = Literal["even", "odd"]
 REGIONS = ("outside-wedge", "inside-wedge")
-WORDS = {str: "a text", Path: "a path", Mapping: "a mapping", Sequence: "a list", type(None): "None"} | {
-    bool: "True or False",
-    int: "a whole number",
-}
-WIDER = {Path: PathLike, Sequence: Iterable}
-"""Types of arguments as errors name them, and what is taken in their place."""
 SMOOTHING = ("smooth_gains", "gain_delay", "smoothness")
 """Fields of calibrators that make gains smooth."""
 
@@ -86,18 +79,14 @@ SMOOTHING = ("smooth_gains", "gain_delay", "smoothness")
 def _typed(function: Callable[P, R]) -> Callable[P, R]:
     """Refuse arguments of other types than the function's own, with a sentence that names the argument."""
     signature = inspect.signature(function)
-    kinds = {
-        name: [get_origin(kind) or kind for kind in alternatives(eval(parameter.annotation, globals()))]
-        for name, parameter in signature.parameters.items()
-    }
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         for name, value in signature.bind_partial(*args, **kwargs).arguments.items():
-            wide = tuple(WIDER.get(kind, kind) for kind in kinds[name])
-            if Any not in wide and not isinstance(value, wide):
-                allowed = [WORDS[kind] for kind in kinds[name]]
-                raise InputError(f"{name} = {value!r}: must be {' or '.join(allowed)}")
+            hint = signature.parameters[name].annotation
+            kinds = [get_origin(kind) or kind for kind in alternatives(eval(hint, globals()))]
+            if Any not in kinds and not isinstance(value, tuple(kinds)):
+                raise InputError(f"{name} = {value!r}: must be of the type {hint}")
         return function(*args, **kwargs)
 
     return checked
@@ -137,7 +126,7 @@ def open_run(folder: str | Path) -> OpenRun:
 
 @_typed
 def calibrate_data(
-    data: str | Path | Sequence[str | Path],
+    data: str | Path | Iterable[str | Path],
     output: str | Path = "calibrated",
     observed: Mapping[str, Any] | None = None,
     overwrite: bool = False,

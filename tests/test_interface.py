@@ -82,15 +82,15 @@ def test_a_budget_that_is_none_is_refused(file, budget):
 
 
 def test_arguments_of_other_types_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"^source = 3: must be a text or a path or a mapping$"):
+    with pytest.raises(InputError, match=r"^source = 3: must be of the type str \| Path \| Mapping"):
         calstudy.load(3)
-    with pytest.raises(InputError, match=r"^scale = 3: must be a text or None$"):
+    with pytest.raises(InputError, match=r"^scale = 3: must be of the type str \| None$"):
         calstudy.load("quickstart", scale=3)
-    with pytest.raises(InputError, match=r"^data = 5: must be a text or a path or a list$"):
+    with pytest.raises(InputError, match=r"^data = 5: must be of the type str \| Path \| Iter"):
         calstudy.calibrate_data(5)
-    with pytest.raises(InputError, match=r"^observed = 'x': must be a mapping or None$"):
+    with pytest.raises(InputError, match=r"^observed = 'x': must be of the type Mapping\[str, Any\] \| None$"):
         calstudy.calibrate_data(tmp_path / "x", observed="x")
-    with pytest.raises(InputError, match=r"^folder = None: must be a text or a path$"):
+    with pytest.raises(InputError, match=r"^folder = None: must be of the type str \| Path$"):
         calstudy.open_run(None)
     with pytest.raises(TypeError, match="missing 1 required"):
         calstudy.load()

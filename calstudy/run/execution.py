@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-ADDRESS = re.compile(r"(\w+://)?\S+:\d+|inproc://\S+")
-"""Of a dask scheduler."""
 SPARE = 10e6
 """Bytes that must be free beside the estimated size of a product before it is made."""
 
@@ -251,8 +249,8 @@ class Budget:
             )
         if self.max_memory is not None and not isinstance(self.max_memory, str):
             raise InputError(f"max_memory = {self.max_memory!r}: must be a text with a unit, such as '6 GB'")
-        named = str(self.scheduler)
-        if self.scheduler is not None and not ADDRESS.fullmatch(named) and not Path(named).is_file():
+        named, address = str(self.scheduler), r"(\w+://)?\S+:\d+|inproc://\S+"
+        if self.scheduler is not None and not re.fullmatch(address, named) and not Path(named).is_file():
             raise InputError(
                 f"scheduler = {self.scheduler!r}: must be an address, such as 'tcp://host:8786', or the scheduler file "
                 "that a running dask cluster wrote"

@@ -394,8 +394,6 @@ def calibration_file(sections: Mapping[str, Any], output: Path, overrides: Seque
 
 def require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
-    if output.exists() and not output.is_dir():
-        raise InputError(f"output = {output}: is a file, not a folder")
     if (present := results_in(output)) and not overwrite:
         raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
     require_writable(output.absolute(), f"output = {output}")

@@ -77,8 +77,8 @@ def _require_small_errors(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    checks = (_needless_limit, _needless_count, _average, _needless_chunks, _distant_box)
-    return tuple(note for check in checks if (note := check(experiment)))
+    found = (_needless_limit(experiment), _average(experiment), _needless_chunks(experiment), _distant_box(experiment))
+    return tuple(note for note in found if note)
 
 
 def _needless_limit(experiment: Experiment) -> str:
@@ -110,20 +110,6 @@ def _needless_chunks(experiment: Experiment) -> str:
     if chunks <= max(channels, SimulationSettings().chunks):
         return ""
     return f"simulation.chunks = {chunks}: the EoR is simulated in {channels} parts, for there are no more channels"
-
-
-def _needless_count(experiment: Experiment) -> str:
-    sky = experiment.sky.foregrounds
-    if not isinstance(sky, SyntheticSources) or sky.count is None:
-        return ""
-    expected = expected_sources(sky.flux_limit)
-    # The brightest are a catalogue, and more than the counts have.
-    if sky.count <= 2 * expected + 1000:
-        return ""
-    return (
-        f"sky.foregrounds.count = {sky.count}: keeps all, for only about {expected:.2g} sources are brighter than "
-        f"sky.foregrounds.flux_limit = {sky.flux_limit:g} Jy"
-    )
 
 
 def _average(experiment: Experiment) -> str:
@@ -161,8 +147,7 @@ def _distant_box(experiment: Experiment) -> str:
 def _kept(foregrounds: Foregrounds, channels: Channels) -> int | None:
     """Return the number of kept sources; None if it is not known, for the flux limit and not the count limits it."""
     if isinstance(foregrounds, GleamSources | FileSources):
-        plain = foregrounds.with_defaults("errors")
-        return _of_file(plain, channels, digest_json(identity(plain)))
+        return _of_file(foregrounds, channels, digest_json(identity(foregrounds)))
     if not isinstance(foregrounds, SyntheticSources) or foregrounds.count is None:
         return None
     # Several standard deviations of the number drawn, and of the cosmic scatter of bright sources.

@@ -198,6 +198,7 @@ IMPLAUSIBLE: list[tuple[str, Any, str]] = [
     ("sky.eor.index", -2, "-2 has no effect with spectrum: flat"),
     ("sky.eor.nside", "64", "is a text; write it without quotes"),
     ("sky.eor.nside", 100, "allowed: 16, 32, 64, 128, 256"),
+    ("sky.foregrounds.count", 10**12, "at most 100000000"),
     ("sky.foregrounds.flux_limit", "1e9 Jy", "at most 197 Jy"),
     ("sky.foregrounds.flux_limit", "200 Jy", "at most 197 Jy"),
     ("sky.foregrounds.flux_limit", "1 uJy", "at least 0.001 Jy"),

@@ -200,7 +200,7 @@ COMMANDS = [
     (["calibrate", "x" * 300], "cannot be read (File name too long)"),
     (["calibrate", "file.yaml", "--gains", "x" * 300], "File name too long"),
     (["calibrate", "x", "--max-memory", "lots"], "write a positive number"),
-    (["calibrate", "x", "--output", "list.yaml"], "--output list.yaml: is a file, not a folder"),
+    (["calibrate", "x", "--output", "list.yaml"], "list.yaml is a file; a folder is needed)"),
     (["banana"], "No such command 'banana'"),
 ]
 """Command lines that cannot be meant, and what the answer says."""
@@ -281,7 +281,6 @@ def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tm
     [
         ("power.coherent_time=1 s", "is shorter than an integration of"),
         ("simulation.chunks=50", "simulation.chunks = 50: the EoR is simulated in"),
-        ("sky.foregrounds.count=1000000000000", "keeps all, for only about "),
     ],
 )
 def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path, capsys, monkeypatch):

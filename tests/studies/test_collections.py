@@ -194,13 +194,6 @@ def test_a_member_that_cannot_be_used_is_told(tmp_path, changes, told):
         load_study(write(tmp_path, **changes))
 
 
-def test_a_key_of_the_collection_is_not_taken_for_one_of_its_members(folder):
-    with pytest.raises(
-        InputError, match=r"^--set roles\.dense: roles can only be changed in the file; .* fields of each"
-    ):
-        load_study(write(folder), overrides=["roles.dense=hexagon"])
-
-
 def test_an_experiment_file_is_an_experiment(folder):
     write(folder)
     assert isinstance(load_study(folder / "hex.yaml"), ExperimentStudy)

@@ -231,7 +231,9 @@ def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_p
     assert changed.calibration.solver.max_steps == 7 != other.calibration.solver.max_steps
     with pytest.raises(InputError, match=r"^--set figures\.0: set figures as a whole$"):
         load_study(path, overrides=["figures.0=comparison-matrix"])
-    with pytest.raises(InputError, match=r"^--set experiment: experiment can only be changed in the file; .*, worlds"):
+    with pytest.raises(
+        InputError, match=r"^--set experiment: set fields of the experiment by their own paths, or .*worlds"
+    ):
         load_study(path, overrides=["experiment=other.yaml"])
     with pytest.raises(ExperimentError, match=r"sky\.eor\.sed"):
         load_study(comparison_file(tmp_path), overrides=["worlds={ideal: {sky.eor.sed: 9}}"])

@@ -32,12 +32,8 @@ class GaussianBeam(BeamModel):
     """A Gaussian power beam whose width scales with wavelength."""
 
     kind: str = "gaussian"
-    fwhm_deg: float = Field(
-        22.0, ge=0.01, lt=180, description="Full width at half maximum of the power beam, in degrees."
-    )
-    reference_frequency: Frequency = Field(
-        182.0e6, ge=10e6, le=10e9, description="Frequency at which the width is `fwhm_deg`."
-    )
+    fwhm_deg: float = Field(22.0, ge=0.01, lt=180, description="Full width at half maximum of the power beam, degrees.")
+    reference_frequency: Frequency = Field(182.0e6, ge=10e6, le=10e9, description="Where the width is `fwhm_deg`.")
 
     def make(self, channels: Channels) -> Beam:
         """Return the beam, which is valid at any frequency."""

@@ -95,7 +95,6 @@ class Collection(Family):
     @classmethod
     def load(cls, file: StudyFile) -> Collection:
         """Return the collection of a file, whose scale and overrides go to every member."""
-        cls.require_fields(text.partition("=")[0].strip() for text in file.overrides)
         content = checked(CollectionFile, file.content, file.folder)
         members = _load_members(content, file)
         roles = _roles(content, members)

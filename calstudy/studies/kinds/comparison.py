@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-import numpy as np
 import yaml
 from pydantic import BeforeValidator, Field, field_validator
 
@@ -53,6 +52,8 @@ LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it, but for `calibration.assumed`."""
 CALIBRATOR = f"calibration.{CALIBRATORS.tag}"
+OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
+"""Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
 WITHOUT_EFFECT = ("name", "description", "papers", "outputs.figures", "outputs.tables", *NOT_SHARED[1:])
 """Fields of an experiment that make nothing in a comparison, whose cases have scores alone."""
 VARIANTS_NEEDED = (
@@ -200,7 +201,6 @@ class Comparison(Family):
         "case."
     )
     subfolders = ("cases",)
-    settable = ("name", "description", "calibrators", "worlds", "figures", "salt")
 
     refusals: Mapping[str, str]
     resolved: Mapping[str, Any]
@@ -216,14 +216,16 @@ class Comparison(Family):
         ----------
         file
             Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
-            `settable` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all
+            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all
             others are applied to the experiment of every case.
         calibrators : in place of those of the file
         """
         content, base, overrides, worlds = _read(file, calibrators)
         members = _experiments(content, worlds, base, lambda data: validate(data, file.folder))
         refusals = {label: refusal for label in members if (refusal := refusal_of_calibrator(members[label]))}
-        _require_different(members, worlds, content.calibrators)
+        cases, count = list(members.values()), len(content.calibrators)
+        _require_different("worlds", {world: cases[row * count :][:count] for row, world in enumerate(worlds)})
+        _require_different("calibrators", {label: cases[at::count] for at, label in enumerate(content.calibrators)})
 
         def check(scale: str | None) -> None:
             content, base, _, worlds = _read(replace(file, scale=scale, overrides=()), calibrators)
@@ -455,6 +457,8 @@ def _with_changes(
     overrides = dict(content.overrides)
     worlds = {world: dict(fields) for world, fields in content.worlds.items()}
     for path, value in changes.items():
+        if path.partition(".")[0] in ("experiment", "overrides"):
+            raise InputError(f"--set {path}: set fields of the experiment by their own paths, or {', '.join(OWN)}")
         if (refusal := _refusal(path, value)) is not None:
             raise InputError(f"--set {path}: {refusal}")
         # Blocks of calibrators come after overrides, and before worlds.
@@ -502,17 +506,13 @@ def _require_effect(calibration: Any) -> None:
 def _read(
     file: StudyFile, calibrators: Mapping[str, Any] | None
 ) -> tuple[ComparisonFile, dict[str, Any], dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the changed content, the experiment that all cases start from with its overrides, these, and the worlds.
-
-    Parameters and errors are those of `Comparison.load`.
-    """
+    """Return the changed content, the experiment that all cases start from, its overrides, and the worlds."""
     scales = file.content.get("scales")
     own = file.scale if isinstance(scales, dict) and file.scale in scales else None
     data = apply_scale(file.content, own)
     changes = dict(parse_override(text) for text in file.overrides)
-    for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in Comparison.settable]:
+    for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
         data = _changed(data, dotted, changes.pop(dotted))
-    Comparison.require_fields(changes)
     if calibrators is not None:
         data[Comparison.key] = dict(calibrators)
     content = checked(ComparisonFile, data, file.folder)
@@ -569,18 +569,13 @@ def _experiments(
     return members
 
 
-def _require_different(members: Mapping[str, Experiment], worlds: Iterable[str], calibrators: Iterable[str]) -> None:
+def _require_different(key: str, cases: Mapping[str, Sequence[Experiment]]) -> None:
     """Raise ExperimentError if two worlds, or two calibrators, have the same experiments, whose cases are the same."""
-    labels = {"worlds": list(worlds), "calibrators": list(calibrators)}
-    made = np.reshape(
-        [digest_json(identity(what_is_made(member))) for member in members.values()], [*map(len, labels.values())]
-    )
-    for key, rows in zip(labels, (made, made.T), strict=True):
-        seen: dict[tuple[str, ...], str] = {}
-        for label, row in zip(labels[key], rows, strict=True):
-            same = seen.setdefault(tuple(row), label)
-            if same != label:
-                raise ExperimentError([f"{key}: {label!r} is the same as {same!r}; change a field in it, or remove it"])
+    seen: dict[str, str] = {}
+    for label, members in cases.items():
+        same = seen.setdefault(digest_json([identity(what_is_made(member)) for member in members]), label)
+        if same != label:
+            raise ExperimentError([f"{key}: {label!r} is the same as {same!r}; change a field in it, or remove it"])
 
 
 def _listed(cases: Sequence[str]) -> str:

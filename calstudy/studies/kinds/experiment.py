@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 from pydantic import BaseModel
 
@@ -165,25 +165,10 @@ class Family(Study):
     ----------
     file : content of the file
     members : the experiments by label, all with the same store and folder of runs
-    settable : keys of the file that --set changes in the file itself
     """
-
-    settable: ClassVar[tuple[str, ...]] = ()
 
     file: Any
     members: Mapping[str, Experiment]
-
-    @classmethod
-    def require_fields(cls, paths: Iterable[str]) -> None:
-        """Raise InputError for a change by --set of a key that the file has, and its experiments have not."""
-        for path in paths:
-            key = path.partition(".")[0]
-            if key in cls.model.model_fields and key not in Experiment.model_fields:
-                also = f", and {', '.join(cls.settable)}" if cls.settable else ""
-                raise InputError(
-                    f"--set {path}: {key} can only be changed in the file; --set changes fields of each of its "
-                    f"experiments, such as instrument.times.count{also}"
-                )
 
     def member(self, label: str) -> ExperimentStudy:
         """Return the study of a member."""
