@@ -15,18 +15,20 @@ of pandas, and the objects of pyuvdata::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property, wraps
 from html import escape
 from io import StringIO
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin
 
 import yaml
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.gains import draw_gains, read_gain_errors
+from calstudy.base.schema import alternatives
 from calstudy.experiment.files import StudyFile
 from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
@@ -66,12 +68,31 @@ if TYPE_CHECKING:
     from calstudy.experiment.model import Experiment, Folders, Variant
     from calstudy.power.transfer import TransferFunction
 
+P = ParamSpec("P")
+R = TypeVar("R")
 Half = Literal["even", "odd"]
 REGIONS = ("outside-wedge", "inside-wedge")
 SMOOTHING = ("smooth_gains", "gain_delay", "smoothness")
 """Fields of calibrators that make gains smooth."""
 
 
+def _typed(function: Callable[P, R]) -> Callable[P, R]:
+    """Refuse arguments of other types than the function's own, with a sentence that names the argument."""
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in signature.bind_partial(*args, **kwargs).arguments.items():
+            hint = signature.parameters[name].annotation
+            kinds = [get_origin(kind) or kind for kind in alternatives(eval(hint, globals()))]
+            if Any not in kinds and not isinstance(value, tuple(kinds)):
+                raise InputError(f"{name} = {value!r}: must be of the type {hint}")
+        return function(*args, **kwargs)
+
+    return checked
+
+
+@_typed
 def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
     """Load a study.
 
@@ -97,13 +118,15 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
     return LoadedStudy(load_study(Path(source), scale, texts))
 
 
+@_typed
 def open_run(folder: str | Path) -> OpenRun:
     """Open the folder of a finished run; raises InputError for another folder."""
     return OpenRun(RunFolder(Path(folder)))
 
 
+@_typed
 def calibrate_data(
-    data: str | Path | Sequence[str | Path],
+    data: str | Path | Iterable[str | Path],
     output: str | Path = "calibrated",
     observed: Mapping[str, Any] | None = None,
     overwrite: bool = False,

@@ -75,10 +75,25 @@ def test_a_plan_is_a_table_and_a_mapping(file):
     assert plan.stages.loc["calibrate", "products"] == 4
 
 
-@pytest.mark.parametrize("budget", [{"workers": 0}, {"workers": "2"}, {"max_memory": 6}])
+@pytest.mark.parametrize("budget", [{"workers": 0}, {"workers": "2"}, {"max_memory": 6}, {"scheduler": "nonsense"}])
 def test_a_budget_that_is_none_is_refused(file, budget):
     with pytest.raises(InputError, match=f"{next(iter(budget))} = .*must be"):
-        calstudy.load(file).plan(**budget)
+        calstudy.load(file).run(**budget)
+
+
+def test_arguments_of_other_types_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"^source = 3: must be of the type str \| Path \| Mapping"):
+        calstudy.load(3)
+    with pytest.raises(InputError, match=r"^scale = 3: must be of the type str \| None$"):
+        calstudy.load("quickstart", scale=3)
+    with pytest.raises(InputError, match=r"^data = 5: must be of the type str \| Path \| Iter"):
+        calstudy.calibrate_data(5)
+    with pytest.raises(InputError, match=r"^observed = 'x': must be of the type Mapping\[str, Any\] \| None$"):
+        calstudy.calibrate_data(tmp_path / "x", observed="x")
+    with pytest.raises(InputError, match=r"^folder = None: must be of the type str \| Path$"):
+        calstudy.open_run(None)
+    with pytest.raises(TypeError, match="missing 1 required"):
+        calstudy.load()
 
 
 def test_spectra_are_those_of_the_tables(run):

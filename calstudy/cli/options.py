@@ -45,9 +45,13 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON in place of a t
 
 
 def with_runs(overrides: list[str] | None, output: Path | None) -> list[str]:
-    """Return the changes of a file by --set and --output."""
-    runs = [] if output is None else [f"outputs.runs={json.dumps(str(output.resolve()))}"]
-    return [*(overrides or ()), *runs]
+    """Return the changes of a file by --set and --output; raises InputError if the folder cannot be written."""
+    if output is None:
+        return overrides or []
+    from calstudy.run.store import require_writable
+
+    require_writable(output.absolute(), f"--output {output}")
+    return [*(overrides or ()), f"outputs.runs={json.dumps(str(output.resolve()))}"]
 
 
 SECTIONS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -199,25 +199,25 @@ def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
     return overridden(data, scales[scale])
 
 
-def _require_scales(data: Mapping[str, Any], base: Path, valid: Sequence[str | None] = ()) -> None:
-    """Raise ExperimentError if any scale of a file that is valid without has invalid overrides.
+def require_scales(
+    content: Mapping[str, Any], check: Callable[[str | None], object], valid: Sequence[str | None] = ()
+) -> None:
+    """Raise ExperimentError if `check` refuses any scale of a file that it accepts without, for which it gets None.
 
-    `valid` are scales, or None for the file without, that are known to be valid. Input files of scales may be missing.
+    `valid` are scales, or None, that are known to be valid.
     """
-    scales = data["scales"] if isinstance(data["scales"], dict) else {}
+    scales = content["scales"] if isinstance(content.get("scales"), dict) else {}
     faults: list[str] = []
     for name in (None, *(name for name, changes in scales.items() if isinstance(changes, dict))):
         if not scales or name in valid:
             continue
         try:
-            changed = apply_scale(data, name)
-            Experiment.model_validate(changed, context={"folder": base, "files": False})
-        except ValidationError as error:
+            check(name)
+        except InputError as error:
             if name is None:
                 return  # The faults of the file itself are reported first.
-            faults += [f"scales.{name}: {sentence}" for sentence in sentences(error, Experiment, changed)]
-        except InputError as error:
-            faults.append(f"scales.{name}: {error}")
+            found = error.faults if isinstance(error, ExperimentError) else [str(error)]
+            faults += [f"scales.{name}: {sentence}" for sentence in found]
     if faults:
         raise ExperimentError(faults)
 
@@ -265,14 +265,14 @@ def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
     return experiment.model_copy(update={"calibration": calibration})
 
 
-def checked(model: type[M], data: Mapping[str, Any], base: Path, prefix: str = "") -> M:
+def checked(model: type[M], data: Mapping[str, Any], base: Path, prefix: str = "", files: bool = True) -> M:
     """Return the content of a file as a section; relative paths of plug-ins and input files start at the folder `base`.
 
-    Raises ExperimentError with one sentence per fault: the field's dotted path, after the prefix, the value, and the
-    allowed values.
+    Input files must exist if `files`. Raises ExperimentError with one sentence per fault: the dotted path of the field,
+    after the prefix, the value, and the allowed values.
     """
     try:
-        return model.model_validate(dict(data), context={"folder": base})
+        return model.model_validate(dict(data), context={"folder": base, "files": files})
     except ValidationError as error:
         raise ExperimentError([f"{prefix}{sentence}" for sentence in sentences(error, model, dict(data))]) from None
 
@@ -324,12 +324,16 @@ class StudyFile:
         """Return the changed content as an experiment, of which all scales are valid; errors as for `read`."""
         data = self.changed()
         content = {**self.content, "scales": data.get("scales")}
+
+        def check(scale: str | None) -> None:
+            checked(Experiment, apply_scale(content, scale), self.folder, files=False)
+
         try:
             experiment = validate(data, self.folder)
         except ExperimentError:
-            _require_scales(content, self.folder)
+            require_scales(content, check)
             raise
-        _require_scales(content, self.folder, () if self.overrides else (self.scale,))
+        require_scales(content, check, () if self.overrides else (self.scale,))
         return experiment
 
 

@@ -245,7 +245,7 @@ def diagnose(
     records = [record for record in result.solutions if record.polarization == number]
     quality = assess(data, result, polarization)
     return Diagnostics(
-        polarization=model.get_pols()[polarization],
+        polarization=quality.polarization,
         unit=model.vis_units,
         delay=np.fft.fftshift(np.fft.fftfreq(grid.n_channels, grid.width)),
         lengths=lengths[order],
@@ -286,8 +286,8 @@ def _shown_gains(
 class DiagnosticsFigure(StudyFigure):
     """Diagnostics of a calibration of measured data, of the even half or of all data."""
 
-    # Gains are drawn with their errors since 2.
-    version: ClassVar[int] = 2
+    # Gains are drawn with their errors since 2, and polarizations named as in the file since 3.
+    version: ClassVar[int] = 3
     kind: str = "diagnostics"
 
     gain_errors: bool | Annotated[int, Field(ge=2)] = Field(

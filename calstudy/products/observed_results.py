@@ -191,10 +191,11 @@ def _shown(ratio: Mapping[str, float | None] | None) -> str:
     return f"{ratio['mean']:.3f} " + ("(error not known)" if error is None else f"± {error:.3f}")
 
 
-class ObservedQuality(Task, stage="observed-quality", version=2):
+class ObservedQuality(Task, stage="observed-quality", version=3):
     """The quality of a calibration: chi^2 against the noise, and outliers.
 
-    High gains are ascribed to noise where the data are as elsewhere since version 2.
+    High gains are ascribed to noise where the data are as elsewhere since version 2. Polarizations are named as in the
+    file since 3.
     """
 
     calibrator: Calibrator = called("calibration")

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 MEDIAN_OVER_MEAN = np.log(2)
 ABOVE_NOISE = 2.0
 """Antennas with a baseline of more than so many times the median power of noise correlate with another."""
+MANY = 4
 
 
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
@@ -80,6 +81,8 @@ def sample_noise(data: UVData) -> float | None:
 def uncorrelated(data: UVData) -> list[int]:
     """Return the numbers of antennas without a cross-correlation above the noise: zero, flagged, or noise alone.
 
+    Where antennas correlate with `MANY` others, one with a single other does so by cross-talk, not by the sky.
+
     Of noise alone is a baseline whose median of |V|^2 / sigma^2, by the radiometer equation, is less than `ABOVE_NOISE`
     times that of noise. None are named if they were half of all: then the data are no measure of them. `data` are
     rectangular and time-major.
@@ -95,7 +98,8 @@ def uncorrelated(data: UVData) -> list[int]:
             medians = np.ma.median(ratios / np.ma.masked_invalid(variance), axis=(0, 2)).filled(np.inf)
             seen[:, polarization] &= medians > ABOVE_NOISE * MEDIAN_OVER_MEAN
     numbers = np.unique(pairs)
-    lost = np.setdiff1d(numbers, pairs[seen.any(axis=1)])
+    counts = np.bincount(np.searchsorted(numbers, pairs[seen.any(axis=1)]).ravel(), minlength=numbers.size)
+    lost = numbers[counts <= (np.median(counts) >= MANY)]
     return lost.tolist() if 2 * lost.size < numbers.size else []
 
 

@@ -17,6 +17,7 @@ from calstudy.base.visibilities import (
     antenna_pairs,
     flag_cube,
     from_cube,
+    polarization_names,
     positions,
     rows_of,
     to_cube,
@@ -167,7 +168,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     names = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.antenna_names, strict=True))
     touching = [(first == row) | (second == row) for row in range(numbers.size)]
     return Quality(
-        polarization=result.model.get_pols()[polarization],
+        polarization=polarization_names([result.model.polarization_array[polarization]]),
         antennas=np.array([str(names[int(number)]) for number in numbers]),
         frequency=np.asarray(result.model.freq_array, float),
         gain_by_channel=by_channel,

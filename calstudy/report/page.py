@@ -403,11 +403,14 @@ def read_several(folders: Sequence[Path]) -> Several:
     """Read run folders; raises InputError if one of them is not that of a finished run, or there are too many."""
     if not 2 <= len(folders) <= MOST:
         raise InputError(f"a page of several runs has 2 to {MOST}, not {len(folders)}")
+    places = [folder.resolve() for folder in folders]
+    if twice := [str(folder) for folder, place in zip(folders, places, strict=True) if places.count(place) > 1]:
+        raise InputError(f"{twice[-1]}: the same run twice; a page of several runs compares different ones")
     runs = [RunFolder(folder) for folder in folders]
     contents = [read_contents(run) for run in runs]
     names = [found.title for found in contents]
     if len(set(names)) < len(names):
-        names = [folder.resolve().name for folder in folders]
+        names = [place.name for place in places]
     pictures = _matched([{item.name: item for item in found.pictures} for found in contents])
     tables = _matched([{item.title: item for item in found.tables} for found in contents])
     claims = tables.pop(CLAIMS_TITLE, None)

@@ -49,7 +49,8 @@ class PointSources(Section):
     spectrum: Literal["flat", "catalogue"] = Field(
         "flat", description="The same flux in all channels, as in the paper, or the spectral indices of the catalogue."
     )
-    count: int | None = Field(None, ge=1, description="Keep only the brightest `count` sources (all by default).")
+    # The whole sky has a tenth of so many above 1 mJy.
+    count: int | None = Field(None, ge=1, le=10**8, description="Keep the brightest `count` sources (all by default).")
     errors: CatalogueErrors = CatalogueErrors()
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -20,11 +20,11 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
-from calstudy.base.gains import gain_products, gains_for
+from calstudy.base.gains import gain_products, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
-from calstudy.base.visibilities import antenna_pairs, flag_cube, polarization_names
+from calstudy.base.visibilities import antenna_pairs, flag_cube
 from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator, SolvePlan
@@ -56,6 +56,9 @@ from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import LOG, log_to, publish
 from calstudy.studies.study import RunProducts, Study, make
+
+if TYPE_CHECKING:
+    from pyuvdata import UVCal
 
 FIGURE, UNFINISHED, IN_USE = "diagnostics", ".unfinished", ".calibrating"
 GainFormat = Literal["calfits", "h5parm", "hyperdrive", "mwaocal"]
@@ -257,12 +260,20 @@ class DataCalibration(DataStudy):
             if self.start is not None:
                 gains = read_gains(self.start, "calibration.initial_gains.path", data)
                 starting_gains(observation.baselines(fitted), gains)
-                unknown = ~np.isfinite(gains_for(gains, data)).any(axis=(1, 2, 3))
-                if unknown.any():
-                    doubts.append(
-                        f"The gains of {unknown.sum()} of {unknown.size} antennas are flagged; these start from unity."
-                    )
+                doubts += self._without_start(gains)
         return [*notes, *doubts]
+
+    def _without_start(self, gains: UVCal) -> list[str]:
+        """Return a sentence if the data have antennas, channels or single samples without a gain to start from."""
+        facts = self.data.facts[WHOLE]
+        values, flags = solutions(gains, self.frames[0].numbers, facts.frequencies, np.array(facts.polarizations))
+        unknown = flags | ~np.isfinite(values) | (values == 0)
+        antennas = unknown.all(axis=(1, 2, 3))
+        channels = unknown[~antennas].all(axis=(0, 2, 3))
+        samples = unknown[~antennas][:, ~channels]
+        counts = {"antennas": antennas, "channels": channels, "other gains": samples}
+        told = [f"{of.sum()} of {of.size} {name}" for name, of in counts.items() if of.any()]
+        return [f"No gains to start from are known for {' and '.join(told)}; these start from unity."] if told else []
 
     @property
     def start(self) -> Path | None:
@@ -287,11 +298,16 @@ class DataCalibration(DataStudy):
 
     def _write(self, made: RunProducts) -> dict[str, Any]:
         """Write all results or none."""
+        from pyuvdata import UVCal
+
         folder = self.outputs.runs
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as temporary:
             work = Path(temporary)
             publish([made.products[task.key] for task in self.targets], work)
             solution = self._solution(made, read_json(work / SOLUTION), read_json(work / QUALITY)[WHOLE])
+            if self.start is not None:
+                gains = read_gains(self.start, "calibration.initial_gains.path", UVCal.from_file(work / GAINS))
+                solution["notes"] += self._without_start(gains)
             if self.file.gain_errors:
                 for record, found in zip(solution["records"], read_json(work / ERRORS)["records"], strict=True):
                     record["gain_errors"] = found
@@ -334,11 +350,6 @@ class DataCalibration(DataStudy):
         section = self.file.observed
         tasks = (observed(self.graph, WHOLE), *self.tables)
         notes = [made.products[task.key].record["notes"] for task in tasks]
-        # pyuvdata names a polarization by the directions of its feeds; options have the names of the file.
-        names = {
-            f"{item['polarization']}: ": f"{polarization_names([number])}: "
-            for item, number in zip(found["quality"], self.data.facts[WHOLE].polarizations, strict=True)
-        }
         return {
             "calstudy": __version__,
             "data": [str(path) for path in section.data],
@@ -348,9 +359,7 @@ class DataCalibration(DataStudy):
             "flag_interference": section.flag_interference is not None,
             "settings": self.file.calibration.model_dump(mode="json"),
             "notes": notes[0]["changes"],
-            "warnings": [
-                names.get(text[:4], text[:4]) + text[4:] for note in notes for text in note.get("warnings", ())
-            ],
+            "warnings": [text for note in notes for text in note.get("warnings", ())],
             "plan": self.described(),
             "quality": found.pop("quality"),
             "chi_squared": found or None,
@@ -384,8 +393,6 @@ def calibration_file(sections: Mapping[str, Any], output: Path, overrides: Seque
 
 def require_free(output: Path, overwrite: bool) -> None:
     """Raise InputError if a folder cannot be written, or has results of a calibration that may not be replaced."""
-    if output.exists() and not output.is_dir():
-        raise InputError(f"output = {output}: is a file, not a folder")
     if (present := results_in(output)) and not overwrite:
         raise InputError(f"output = {output}: holds {', '.join(present)} already; use `overwrite` or another folder")
     require_writable(output.absolute(), f"output = {output}")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
 from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.calibrate.execution import require_calibratable
@@ -14,14 +18,14 @@ from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assum
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.interface import model_of
 from calstudy.instrument.layouts import Layout, make_array, make_layout, size_of_instrument
-from calstudy.instrument.settings import InstrumentSettings, nominal_beams
+from calstudy.instrument.settings import Channels, InstrumentSettings, nominal_beams
 from calstudy.power.interface import require_antennas
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.counts import expected_sources
-from calstudy.sky.settings import Eor, Foregrounds, SyntheticSources
+from calstudy.sky.settings import Eor, FileSources, Foregrounds, GleamSources, PointSources, SyntheticSources
 
 LONG_AVERAGE = 15.0
 """Minutes; the sky moves by a sixth of the beam of an MWA tile."""
@@ -82,12 +86,15 @@ def _needless_limit(experiment: Experiment) -> str:
     limit = "sky.foregrounds.flux_limit"
     if limit not in assumed:
         return ""
-    kept = [_catalogue_depth(sky.foregrounds) for sky in (experiment.sky, assumed_world(experiment).sky)]
+    skies = [sky.foregrounds for sky in (experiment.sky, assumed_world(experiment).sky)]
+    if len({sky.with_defaults("flux_limit", "count", "errors") for sky in skies if isinstance(sky, PointSources)}) != 1:
+        return ""
+    kept = [_kept(sky, experiment.instrument.channels) for sky in skies]
     if None in kept or kept[0] != kept[1]:
         return ""
     return (
-        f"{FIELD}.{limit} = {str(assumed[limit])!r}: assumes the sky that the data have, for none of its {kept[0]} "
-        "brightest sources (sky.foregrounds.count) is fainter; the sky model misses none of them"
+        f"{FIELD}.{limit} = {str(assumed[limit])!r}: assumes the sky that the data have, for none of the {kept[0]} "
+        "sources that it keeps is fainter; the sky model misses none of them"
     )
 
 
@@ -137,13 +144,24 @@ def _distant_box(experiment: Experiment) -> str:
     )
 
 
-def _catalogue_depth(foregrounds: Foregrounds) -> int | None:
-    """Return the number of kept sources if it is limited by their count, not by the flux limit; else None."""
+def _kept(foregrounds: Foregrounds, channels: Channels) -> int | None:
+    """Return the number of kept sources; None if it is not known, for the flux limit and not the count limits it."""
+    if isinstance(foregrounds, GleamSources | FileSources):
+        return _of_file(foregrounds, channels, digest_json(identity(foregrounds)))
     if not isinstance(foregrounds, SyntheticSources) or foregrounds.count is None:
         return None
     # Several standard deviations of the number drawn, and of the cosmic scatter of bright sources.
     surely = 0.8 * expected_sources(foregrounds.flux_limit) - 100
     return foregrounds.count if surely > foregrounds.count else None
+
+
+@lru_cache
+def _of_file(foregrounds: GleamSources | FileSources, channels: Channels, digest: str) -> int:
+    """Return the number of kept sources of a catalogue, whose content has a digest."""
+    from calstudy.sky.foregrounds import make_foregrounds
+
+    del digest
+    return make_foregrounds(foregrounds, channels.first + channels.width * np.arange(channels.count)).sky.Ncomponents
 
 
 def require_calibration(experiment: Experiment) -> None:

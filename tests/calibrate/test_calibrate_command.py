@@ -303,13 +303,18 @@ def test_a_dry_run_refuses_what_the_run_refuses(command, data, tmp_path, argumen
         assert sentence in error
 
 
-def test_a_dry_run_says_how_many_antennas_have_no_gains_to_start_from(command, data, tmp_path):
+def test_gains_that_are_not_known_to_start_from_are_counted(command, data, tmp_path):
     gains = make_uvcal(UVData.from_file(str(data)), np.ones((8, 64, 2, 1), complex))
-    gains.flag_array[[1, 3]] = True
     gains.write_calh5(str(tmp_path / "gains.calh5"))
-    code, told = command(data, *OPTIONS, "--gains", "gains.calh5", "--dry-run")
-    assert code == 0
-    assert "The gains of 2 of 8 antennas are flagged; these start from unity." in told
+    for others in (["--dry-run"], ["--output", "whole"]):
+        assert "No gains to start from" not in command(data, *OPTIONS, "--gains", "gains.calh5", *others)[1]
+    gains.flag_array[[1, 3]] = gains.flag_array[:, 5] = gains.flag_array[4, 7, 0] = True
+    gains.write_calh5(str(tmp_path / "gains.calh5"), clobber=True)
+    told = "for 2 of 8 antennas and 1 of 64 channels and 1 of 756 other gains; these start from unity."
+    for others in (["--dry-run"], ["--output", "out"]):
+        code, text = command(data, *OPTIONS, "--gains", "gains.calh5", *others)
+        assert code == 0
+        assert f"No gains to start from are known {told}" in text
 
 
 def test_a_dry_run_says_that_integrations_are_days_apart(command, data):

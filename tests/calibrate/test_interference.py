@@ -189,3 +189,18 @@ def test_antennas_without_a_signal_are_named_unless_they_are_half(clean):
     assert uncorrelated(data) == [12, 16]
     data.flag_array[data.ant_2_array > 16] = True
     assert uncorrelated(data) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "lost"),
+    [
+        # Antennas 65 and 93 correlate with none, and 116 with its neighbour alone; of all three the power is far lower.
+        ("zen.2459122.49827.sum.downselected.uvh5", [65, 93, 116]),
+        ("zen.2457698.40355.xx.HH.uvh5", [81]),
+    ],
+)
+def test_antennas_of_hera_that_see_no_sky_are_named(name, lost):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        data, _ = prepare(read_visibilities([find_data(f"hera_qm:data/{name}", Path())]))
+    assert uncorrelated(data) == lost

@@ -200,7 +200,7 @@ COMMANDS = [
     (["calibrate", "x" * 300], "cannot be read (File name too long)"),
     (["calibrate", "file.yaml", "--gains", "x" * 300], "File name too long"),
     (["calibrate", "x", "--max-memory", "lots"], "write a positive number"),
-    (["calibrate", "x", "--output", "list.yaml"], "--output list.yaml: is a file, not a folder"),
+    (["calibrate", "x", "--output", "list.yaml"], "list.yaml is a file; a folder is needed)"),
     (["banana"], "No such command 'banana'"),
 ]
 """Command lines that cannot be meant, and what the answer says."""
@@ -239,6 +239,15 @@ def planned(capsys, *options: str) -> str:
     return capsys.readouterr().out
 
 
+def test_a_folder_that_is_a_file_is_named_as_it_was_given(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
+    status, message = run_command(capsys, "run", "file.yaml", "--output", "file.yaml")
+    assert status == REFUSED
+    assert message.startswith("calstudy: --output file.yaml: cannot be written (")
+    assert message.endswith("file.yaml is a file; a folder is needed)\n")
+
+
 def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The 100 brightest sources are brighter than 10 Jy.
@@ -250,6 +259,21 @@ def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, ca
     errors = "sky.foregrounds.errors.flux_scale: 1.1"
     told = planned(capsys, "--set", f"calibration.assumed={{sky.foregrounds.flux_limit: 2 Jy, {errors}}}")
     assert "the sky model misses none of them" in " ".join(told.split())
+
+
+def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("sky.csv").write_text("ra,dec,s\n30,-27,9\n31,-26,5\n29,-28,3\n")
+    csv = {"right_ascension": "ra", "declination": "dec", "flux": "s", "frequency": "180 MHz"}
+    sky = {"foregrounds": {"kind": "file", "path": "sky.csv", "csv": csv}, "eor": tiny(tmp_path)["sky"]["eor"]}
+    assumed = {"sky.foregrounds.flux_limit": "4 Jy"}
+    Path("file.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "sky": sky, "calibration": {"assumed": assumed}}))
+    planned(capsys)
+    told = refused(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")
+    assert "for none of the 3 sources that it keeps" in told
+    # A catalogue that was changed is read again.
+    Path("sky.csv").write_text("ra,dec,s\n30,-27,9\n31,-26,5\n29,-28,3\n29,-29,1\n")
+    planned(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")
 
 
 @pytest.mark.parametrize(

@@ -67,3 +67,5 @@ def test_a_page_is_not_overwritten_and_has_a_limit(tmp_path):
     write_several(folders, page, overwrite=True)
     with pytest.raises(InputError, match=f"2 to {MOST}"):
         write_several(folders * 3, tmp_path / "other.html")
+    with pytest.raises(InputError, match=r"a: the same run twice; a page of several runs compares different ones$"):
+        write_several([*folders, tmp_path / "b" / ".." / "a"], tmp_path / "other.html")

@@ -231,6 +231,10 @@ def test_worlds_and_calibrators_can_be_set_as_fields_of_the_experiment_can(tmp_p
     assert changed.calibration.solver.max_steps == 7 != other.calibration.solver.max_steps
     with pytest.raises(InputError, match=r"^--set figures\.0: set figures as a whole$"):
         load_study(path, overrides=["figures.0=comparison-matrix"])
+    with pytest.raises(
+        InputError, match=r"^--set experiment: set fields of the experiment by their own paths, or .*worlds"
+    ):
+        load_study(path, overrides=["experiment=other.yaml"])
     with pytest.raises(ExperimentError, match=r"sky\.eor\.sed"):
         load_study(comparison_file(tmp_path), overrides=["worlds={ideal: {sky.eor.sed: 9}}"])
 
@@ -400,3 +404,37 @@ def test_what_no_case_could_have_is_refused(tmp_path, change, told):
     with pytest.raises(ExperimentError, match=f"^overrides: '{field}' {told}"):
         load_study(comparison_file(tmp_path, overrides=changes))
     load_study(comparison_file(tmp_path), None, ["outputs.figures=[]", "papers=[]"])
+
+
+def test_two_calibrators_that_are_the_same_are_refused(tmp_path):
+    twice = {"sky-based": "sky-based", "mine": {"calibrator": "sky-based", "weights": "gains"}}
+    with pytest.raises(ExperimentError, match="calibrators: 'mine' is the same as 'sky-based'; change a field"):
+        load_study(comparison_file(tmp_path, calibrators=twice))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        (
+            {"overrides": {"instrument.banana": 3}},
+            r"scales\.small: instrument\.banana: unknown key.*in 'sky-based in ideal' and 7 other",
+        ),
+        ({"worlds.ideal": {"sky.eor.sed": 3}}, r"scales\.small: sky\.eor\.sed: unknown key"),
+        ({"calibrators.none": "nobody"}, r"scales\.small: calibration\.calibrator: 'nobody' is not a calibrator"),
+        ({"figurs": []}, r"scales\.small: figurs: unknown key, did you mean 'figures'"),
+        ({"name.x": 3}, r"scales\.small: name: must be a text"),
+    ],
+)
+def test_a_fault_in_a_scale_that_is_not_asked_for_is_found(tmp_path, changes, sentence):
+    path = comparison_file(tmp_path, scales={"small": changes, "other": {"overrides": {"sky.eor.seed": 9}}})
+    for scale in (None, "other"):
+        with pytest.raises(ExperimentError, match=sentence):
+            load_study(path, scale)
+
+
+def test_an_input_file_of_a_scale_that_is_not_asked_for_may_be_missing(tmp_path):
+    layout = {"instrument.layout": {"kind": "csv", "path": "elsewhere.csv"}, "instrument.location": "mwa"}
+    path = comparison_file(tmp_path, scales={"there": {"overrides": layout}})
+    assert load_study(path).cases
+    with pytest.raises(ExperimentError, match=r"elsewhere\.csv"):
+        load_study(path, "there")

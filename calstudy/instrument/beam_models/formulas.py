@@ -14,7 +14,8 @@ class AiryBeam(BeamModel):
     """The beam of a uniformly illuminated circular aperture."""
 
     kind: str = "airy"
-    diameter: Length = Field(4.0, gt=0)
+    # No aperture is larger, and the beam of one would hardly have a source in it. So also for the width of a Gaussian.
+    diameter: Length = Field(4.0, gt=0, le=1e3)
 
     def make(self, channels: Channels) -> Beam:
         """Return the beam, which is valid at any frequency."""
@@ -31,8 +32,8 @@ class GaussianBeam(BeamModel):
     """A Gaussian power beam whose width scales with wavelength."""
 
     kind: str = "gaussian"
-    fwhm_deg: float = Field(22.0, gt=0, lt=180, description="Full width at half maximum of the power beam, in degrees.")
-    reference_frequency: Frequency = Field(182.0e6, gt=0, description="Frequency at which the width is `fwhm_deg`.")
+    fwhm_deg: float = Field(22.0, ge=0.01, lt=180, description="Full width at half maximum of the power beam, degrees.")
+    reference_frequency: Frequency = Field(182.0e6, ge=10e6, le=10e9, description="Where the width is `fwhm_deg`.")
 
     def make(self, channels: Channels) -> Beam:
         """Return the beam, which is valid at any frequency."""

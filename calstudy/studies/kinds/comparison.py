@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -30,6 +30,7 @@ from calstudy.experiment.files import (
     override,
     parse_override,
     read_mapping,
+    require_scales,
     validate,
     with_absolute_paths,
 )
@@ -215,28 +216,23 @@ class Comparison(Family):
         ----------
         file
             Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
-            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
-            applied to the experiment of every case.
+            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all
+            others are applied to the experiment of every case.
         calibrators : in place of those of the file
         """
-        scales = file.content.get("scales")
-        own = file.scale if isinstance(scales, dict) and file.scale in scales else None
-        data = apply_scale(file.content, own)
-        changes = dict(parse_override(text) for text in file.overrides)
-        for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
-            data = _changed(data, dotted, changes.pop(dotted))
-        if calibrators is not None:
-            data[cls.key] = dict(calibrators)
-        content = checked(ComparisonFile, data, file.folder)
+        content, base, overrides, worlds = _read(file, calibrators)
+        members = _experiments(content, worlds, base, lambda data: validate(data, file.folder))
+        refusals = {label: refusal for label in members if (refusal := refusal_of_calibrator(members[label]))}
+        cases, count = list(members.values()), len(content.calibrators)
+        _require_different("worlds", {world: cases[row * count :][:count] for row, world in enumerate(worlds)})
+        _require_different("calibrators", {label: cases[at::count] for at, label in enumerate(content.calibrators)})
+
+        def check(scale: str | None) -> None:
+            content, base, _, worlds = _read(replace(file, scale=scale, overrides=()), calibrators)
+            _experiments(content, worlds, base, lambda data: checked(Experiment, data, file.folder, files=False))
+
+        require_scales(file.content, check, () if file.overrides else (file.scale,))
         figures = figures_for("comparison", content.figures, "figures")
-        overrides, worlds = _with_changes(content, changes)
-        base = overridden(_base(content, file, optional=own is not None), overrides)
-        salted = {"salt": content.salt} if content.salt else {}
-        blocks = {
-            label: {**block, **(salted if block.get(CALIBRATORS.tag) == "by-file" else {})}
-            for label, block in content.calibrators.items()
-        }
-        members, refusals = _make_cases(blocks, worlds, base, file.folder)
         # All others are in the experiment.
         of_calibrators = {path: new for path, new in overrides.items() if path.partition(".")[0] == "calibration"}
         written = {"overrides": of_calibrators, "worlds": worlds, "calibrators": dict(content.calibrators)}
@@ -246,7 +242,7 @@ class Comparison(Family):
             "experiment": _complete(base, file.folder),
             **with_absolute_paths(written, members.values(), file.folder),
             "figures": [figure.model_dump(mode="json") for figure in figures],
-            **salted,
+            **({"salt": content.salt} if content.salt else {}),
         }
         return cls(content, members, refusals, resolved)
 
@@ -461,6 +457,8 @@ def _with_changes(
     overrides = dict(content.overrides)
     worlds = {world: dict(fields) for world, fields in content.worlds.items()}
     for path, value in changes.items():
+        if path.partition(".")[0] in ("experiment", "overrides"):
+            raise InputError(f"--set {path}: set fields of the experiment by their own paths, or {', '.join(OWN)}")
         if (refusal := _refusal(path, value)) is not None:
             raise InputError(f"--set {path}: {refusal}")
         # Blocks of calibrators come after overrides, and before worlds.
@@ -505,6 +503,23 @@ def _require_effect(calibration: Any) -> None:
         )
 
 
+def _read(
+    file: StudyFile, calibrators: Mapping[str, Any] | None
+) -> tuple[ComparisonFile, dict[str, Any], dict[str, Any], dict[str, dict[str, Any]]]:
+    """Return the changed content, the experiment that all cases start from, its overrides, and the worlds."""
+    scales = file.content.get("scales")
+    own = file.scale if isinstance(scales, dict) and file.scale in scales else None
+    data = apply_scale(file.content, own)
+    changes = dict(parse_override(text) for text in file.overrides)
+    for dotted in [dotted for dotted in changes if dotted.partition(".")[0] in OWN]:
+        data = _changed(data, dotted, changes.pop(dotted))
+    if calibrators is not None:
+        data[Comparison.key] = dict(calibrators)
+    content = checked(ComparisonFile, data, file.folder)
+    overrides, worlds = _with_changes(content, changes)
+    return content, overridden(_base(content, file, optional=own is not None), overrides), overrides, worlds
+
+
 def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> dict[str, Any]:
     """Return the experiment from which all cases are made; relative paths start at the folder of the comparison.
 
@@ -528,40 +543,39 @@ def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> dict[str,
         raise ExperimentError([f"experiment ({content.experiment}): {fault}" for fault in error.faults]) from None
 
 
-def _make_cases(
-    calibrators: Mapping[str, Block], worlds: Mapping[str, Mapping[str, Any]], base: Mapping[str, Any], folder: Path
-) -> tuple[dict[str, Experiment], dict[str, str]]:
-    """Return the experiments of all cases, and the refusals; raises ExperimentError with every fault once."""
-    members, refusals = {}, {}
+def _experiments(
+    content: ComparisonFile,
+    worlds: Mapping[str, Mapping[str, Any]],
+    base: Mapping[str, Any],
+    read: Callable[[Mapping[str, Any]], Experiment],
+) -> dict[str, Experiment]:
+    """Return the experiments of all cases, as they are read; raises ExperimentError with every fault once."""
+    members: dict[str, Experiment] = {}
     faults: dict[str, list[str]] = {}
-    for (row, world), (column, calibrator) in itertools.product(enumerate(worlds), enumerate(calibrators)):
-        data = {**base, "calibration": {**base.get("calibration", {}), **calibrators[calibrator]}}
-        data = overridden(data, worlds[world])
+    for (row, world), (column, calibrator) in itertools.product(enumerate(worlds), enumerate(content.calibrators)):
+        block = content.calibrators[calibrator]
+        salt = {"salt": content.salt} if content.salt and block.get(CALIBRATORS.tag) == "by-file" else {}
+        data = {**base, "calibration": {**base.get("calibration", {}), **block, **salt}}
         try:
-            experiment = validate(data, folder)
+            experiment = read(overridden(data, worlds[world]))
             found = [] if experiment.measures_signal_loss else [VARIANTS_NEEDED]
+            members[case_name(row, column)] = experiment
         except ExperimentError as error:
             found = error.faults
         for sentence in found:
             faults.setdefault(sentence, []).append(f"{calibrator} in {world}")
-        if not found:
-            label = case_name(row, column)
-            members[label] = experiment
-            if refusal := refusal_of_calibrator(experiment):
-                refusals[label] = refusal
     if faults:
         raise ExperimentError([f"{sentence} (in {_listed(found)})" for sentence, found in faults.items()])
-    _require_different_worlds(members, list(worlds))
-    return members, refusals
+    return members
 
 
-def _require_different_worlds(members: Mapping[str, Experiment], worlds: Sequence[str]) -> None:
-    """Raise ExperimentError if two worlds are the same experiment, whose cases would be the same twice."""
+def _require_different(key: str, cases: Mapping[str, Sequence[Experiment]]) -> None:
+    """Raise ExperimentError if two worlds, or two calibrators, have the same experiments, whose cases are the same."""
     seen: dict[str, str] = {}
-    for row, world in enumerate(worlds):
-        same = seen.setdefault(digest_json(identity(what_is_made(members[case_name(row, 0)]))), world)
-        if same != world:
-            raise ExperimentError([f"worlds: {world!r} is the same as {same!r}; change a field in it, or remove it"])
+    for label, members in cases.items():
+        same = seen.setdefault(digest_json([identity(what_is_made(member)) for member in members]), label)
+        if same != label:
+            raise ExperimentError([f"{key}: {label!r} is the same as {same!r}; change a field in it, or remove it"])
 
 
 def _listed(cases: Sequence[str]) -> str:
