@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from pyuvdata import UVData
+
 from calstudy.instrument.settings import InstrumentSettings
 
 
@@ -15,3 +18,27 @@ def small_instrument(**changes: object) -> InstrumentSettings:
         **changes,
     }
     return InstrumentSettings.model_validate(sections)
+
+
+def with_autos(data: UVData, power: float) -> UVData:
+    """Return data with autocorrelations of a constant power, and the durations and widths of a radiometer."""
+    times = np.unique(data.time_array)
+    autos = UVData.new(
+        freq_array=data.freq_array,
+        polarization_array=data.polarization_array,
+        times=times,
+        antpairs=[(number, number) for number in data.telescope.antenna_numbers],
+        telescope=data.telescope,
+        integration_time=float(data.integration_time[0]),
+        channel_width=np.asarray(data.channel_width),
+        do_blt_outer=True,
+        empty=True,
+        vis_units=data.vis_units,
+    )
+    autos.data_array[:] = power
+    autos.nsample_array[:] = 1
+    both = data.copy()
+    both.nsample_array[:] = 1
+    both = both.__add__(autos, run_check=False)
+    both.reorder_blts(order="time", minor_order="baseline", run_check=False)
+    return both

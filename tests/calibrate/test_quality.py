@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from command_line import run_and_read, run_command
+from observations import with_autos
 from pyuvdata import UVCal, UVData
 from toy import make_toy, scattered
 from toy_data import make_uvdata
@@ -103,30 +104,6 @@ def test_gains_that_stand_out_are_named(clean):
         assert len(told) == 2
         assert f"{clean.freq_array[CHANNEL] / 1e6:.3f} MHz (80 x); {question}" in told[0]
         assert f"antenna ant{clean.telescope.antenna_numbers[ANTENNA]} (1/10); a dead one?" in told[1]
-
-
-def with_autos(data: UVData, power: float) -> UVData:
-    """Return data with autocorrelations of a constant power, and the durations and widths of a radiometer."""
-    times = np.unique(data.time_array)
-    autos = UVData.new(
-        freq_array=data.freq_array,
-        polarization_array=data.polarization_array,
-        times=times,
-        antpairs=[(number, number) for number in data.telescope.antenna_numbers],
-        telescope=data.telescope,
-        integration_time=float(data.integration_time[0]),
-        channel_width=np.asarray(data.channel_width),
-        do_blt_outer=True,
-        empty=True,
-        vis_units=data.vis_units,
-    )
-    autos.data_array[:] = power
-    autos.nsample_array[:] = 1
-    both = data.copy()
-    both.nsample_array[:] = 1
-    both = both.__add__(autos, run_check=False)
-    both.reorder_blts(order="time", minor_order="baseline", run_check=False)
-    return both
 
 
 def test_with_autocorrelations_chi2_is_in_units_of_the_radiometer_equation(clean):
