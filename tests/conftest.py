@@ -36,8 +36,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--notebook-outputs", metavar="FOLDER", help="write notebooks that were run to this folder")
 
 
-LONGEST = {"test_ladder.py", "test_comparison.py", "test_signal_loss.py", "test_observed.py", "test_regression.py"}
-"""Files that take longest: begun last, one would run alone, on one core, when all others are done."""
+LONGEST = {
+    *("test_ladder.py", "test_comparison.py", "test_signal_loss.py", "test_observed.py", "test_regression.py"),
+    *("test_cli.py", "test_golden_keys.py"),
+}
+"""Files that take longest, or long and come late: begun last, one would run alone when all others are done."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -74,14 +74,8 @@ SLOW_TO_IMPORT = (
 
 
 def test_calibrators_leave_keras_to_those_who_use_it(tmp_path):
-    code = (
-        "import calstudy.calibrate.calamity\n"
-        "assert 'tensorflow' in sys.modules\n"
-        "assert not {'keras', 'sklearn'} & set(sys.modules)\n"
-        "import tensorflow\n"
-        "tensorflow.keras.optimizers.Adamax(0.1)"
-    )
-    assert imported_by(code, ("keras",), tmp_path) == ["keras"]
+    packages = ("tensorflow", "keras", "sklearn")
+    assert imported_by("import calstudy.calibrate.calamity", packages, tmp_path) == ["tensorflow"]
 
 
 def test_plans_import_no_library_that_only_stages_need(tmp_path):
@@ -206,13 +200,13 @@ def test_what_a_terminal_cannot_show_is_a_question_mark(tmp_path):
     assert result.stdout == "1 ? 2\n"
 
 
-@pytest.mark.parametrize("name", ["array", "copy", "logging", "signal"])
-def test_a_file_of_the_working_folder_is_not_taken_for_a_module_of_python(tmp_path, monkeypatch, name):
+def test_a_file_of_the_working_folder_is_not_taken_for_a_module_of_python(tmp_path, monkeypatch):
     # As in an environment that is in the working folder.
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "calstudy").symlink_to(Path(__file__).parents[1] / "calstudy")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
-    (tmp_path / f"{name}.py").write_text("raise ImportError('not this one')")
+    for name in ("array", "copy", "logging", "signal"):
+        (tmp_path / f"{name}.py").write_text("raise ImportError('not this one')")
     result = calstudy("--version", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
 

@@ -8,14 +8,15 @@ from functools import lru_cache
 import pytest
 from toy import HEX, Toy, make_toy, scattered
 
-from calstudy.calibrate.solvers import reduced
+from calstudy.calibrate.solvers import adamax, reduced
 
 
 @pytest.fixture(autouse=True, scope="session")
 def kept_kernels() -> Iterator[None]:
     """Keep more compiled kernels than studies do: the arrays below come again between dozens of others."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reduced, "_kernels", lru_cache(maxsize=32)(reduced._kernels.__wrapped__))
+        for module, name in ((reduced, "_kernels"), (adamax, "compiled")):
+            patch.setattr(module, name, lru_cache(maxsize=32)(getattr(module, name).__wrapped__))
         yield
 
 

@@ -118,7 +118,7 @@ def test_flags_are_carried_and_have_no_influence(toy):
     assert not np.delete(np.delete(gain_flags[:, :, [0, 2]], 7, 1), dead, 0).any()
 
 
-@pytest.mark.parametrize("calibrator", [Calamity, CalamityRedundant])
+@pytest.mark.parametrize("calibrator", [Calamity, pytest.param(CalamityRedundant, marks=pytest.mark.chain)])
 def test_flagged_edges_of_the_band_are_as_if_it_had_no_such_channels(calibrator):
     # Sequences of the whole band would let foregrounds follow smooth gains that all antennas share: gains then differ
     # by a tenth after two steps. Further steps amplify rounding along directions that data hardly see.
@@ -194,11 +194,12 @@ def test_redundant_modelling_of_a_perfect_hexagon():
 
 
 def test_autocorrelations_are_left_out_unless_asked_for():
-    toy = make_toy(scattered(6), autos=True)
+    # Without them the structure is that of the other tests, which is compiled.
+    toy = make_toy(scattered(8), autos=True)
     data = make_uvdata(toy, 1)
-    assert run_calibrator(SETTINGS, data).model.Nbls == 15
+    assert run_calibrator(SETTINGS, data).model.Nbls == 28
     result = run_calibrator(SETTINGS.model_copy(update={"autos": True}), data)
-    assert result.model.Nbls == 21
+    assert result.model.Nbls == 36
     noise = np.sqrt(np.mean(np.abs(toy.noise) ** 2))
     assert np.sqrt(np.mean(np.abs(result.residual.data_array) ** 2)) < noise
 

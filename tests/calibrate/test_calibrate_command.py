@@ -393,26 +393,22 @@ def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(command
     assert found["solver"]["tolerance"] == 0.1
 
 
-def test_python_calibrates_as_the_command_does(data, command, tmp_path, monkeypatch):
-    command(data, *OPTIONS, "--output", "out", "--select", "times=0..0")
+def test_python_calibrates_as_the_command_does(finished, data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     basis = {"basis.buffer": "50 ns", "basis.min_delay": "50 ns"}
-    found = calstudy.calibrate_data(data, "again", {"select": {"times": "0..0"}}, quiet=True, **basis)
-    expected = UVCal.from_file(tmp_path / "out" / "gains.calh5")
+    first = {"select": {"times": "0..0"}}
+    found = calstudy.calibrate_data(data, "again", first, quiet=True, gain_errors=False, **basis)
+    expected = UVCal.from_file(finished[0] / "out" / "gains.calh5")
     # Compiled code and threads add in another order.
-    np.testing.assert_allclose(found.gains.gain_array, expected.gain_array, rtol=1e-6)
+    np.testing.assert_allclose(found.gains.gain_array[:, :, 0], expected.gain_array[:, :, 0], rtol=1e-6)
     assert list(found.solves.status) == ["converged"]
     assert found.model.Ntimes == found.residual.Ntimes == 1
     assert "1 converged" in repr(found)
     with pytest.raises(InputError, match=r"output = again: holds gains\.calh5"):
         calstudy.calibrate_data(data, "again")
-    faster = calstudy.calibrate_data(
-        data, "faster", {"select": {"times": "0..0"}}, quiet=True, gain_errors=False, **basis
-    )
-    np.testing.assert_allclose(faster.gains.gain_array, expected.gain_array, rtol=1e-6)
-    assert all("gain_errors" not in record for record in faster.solution["records"])
+    assert all("gain_errors" not in record for record in found.solution["records"])
     with pytest.raises(InputError, match="has no errors of gains"):
-        _ = faster.gain_errors
+        _ = found.gain_errors
     with pytest.raises(InputError, match=r"calibration\.bsis"):
         calstudy.calibrate_data(data, "other", **{"bsis.buffer": "50 ns"})
 

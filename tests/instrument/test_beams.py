@@ -254,9 +254,10 @@ def test_few_tabulated_frequencies_limit_the_interpolation(tmp_path, embedded):
         make_beam(FileBeam(kind="beamfits", path=path, interpolation="cubic"))
 
 
-def test_frequencies_outside_the_band_are_refused(embedded):
+def test_frequencies_outside_the_band_are_refused(embedded, mwa_table, monkeypatch):
     with pytest.raises(InputError, match="outside the band"):
         embedded.at(np.array([150e6]))
+    monkeypatch.setattr(tabulated, "_read_mwa", lambda *_: mwa_table)
     with pytest.raises(InputError, match="not within"):
         make_beam(MwaEmbeddedBeam(), section.Channels(first="310 MHz"))
 

@@ -63,9 +63,13 @@ class Seeds(Family):
 '''
 
 
+# Of members that share the foregrounds; nothing is calibrated.
+VARIANTS = {"eor": {"components": ["eor"]}, "both": {"components": ["foregrounds", "eor"]}}
+
+
 def write(folder: Path, **changes) -> Path:
     (folder / "seeds.py").write_text(CODE)
-    data = {**tiny(folder), "study": "seeds.py", "seeds": [1, 2], **changes}
+    data = {**tiny(folder), "variants": VARIANTS, "study": "seeds.py", "seeds": [1, 2], **changes}
     data["outputs"] = {**data["outputs"], "figures": ["seeds.py"]}
     path = folder / "seeds.yaml"
     path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not None}))

@@ -30,8 +30,8 @@ ENGINE = DenseEngine()
 
 @pytest.fixture(scope="module")
 def template():
-    """36 tiles to 176 m for 112 s, 100 channels over 8 MHz."""
-    return observe(count=36, channels=100, width="80 kHz", times=28, integration="4 s", polarizations=("xx",))
+    """36 tiles to 176 m for 112 s, 70 channels over 8 MHz."""
+    return observe(count=36, channels=70, width="115 kHz", times=28, integration="4 s", polarizations=("xx",))
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,7 @@ def test_the_check_finds_the_error_that_is_there(tolerance, template, sky, dipol
 
 
 def test_nodes_serve_any_engine(dipole_beam):
-    template = observe(count=3, channels=24, width="80 kHz", times=14, integration="8 s", polarizations=("xx",))
+    template = observe(count=3, channels=14, width="140 kHz", times=14, integration="8 s", polarizations=("xx",))
     sky = random_sky(template, count=12)
     direct = PyuvsimEngine().simulate(sky, dipole_beam, template)
     assert not time_axis(template, accuracy(1e-8)).at_samples

@@ -77,7 +77,7 @@ def test_a_smooth_sky_is_exact_to_its_tolerance(wide, sources, embedded_beam):
 
 
 def test_several_beams_have_patches_too(embedded_beam, dipole_beam):
-    template = observe(count=12, channels=3, width="640 kHz", times=28, integration="4 s")
+    template = observe(count=12, channels=3, width="640 kHz", times=14, integration="8 s")
     beams = AntennaBeams((embedded_beam, dipole_beam), np.arange(12) % 2)
     sky = healpix_sky(template.freq_array, nside=32)
     assert patch_nside(sky.Ncomponents) == 1
