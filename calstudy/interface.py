@@ -22,7 +22,7 @@ from html import escape
 from io import StringIO
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin, get_type_hints
 
 import yaml
 
@@ -82,11 +82,11 @@ def _typed(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        hints = get_type_hints(function)
         for name, value in signature.bind_partial(*args, **kwargs).arguments.items():
-            hint = signature.parameters[name].annotation
-            kinds = [get_origin(kind) or kind for kind in alternatives(eval(hint, globals()))]
+            kinds = [get_origin(kind) or kind for kind in alternatives(hints[name])]
             if Any not in kinds and not isinstance(value, tuple(kinds)):
-                raise InputError(f"{name} = {value!r}: must be of the type {hint}")
+                raise InputError(f"{name} = {value!r}: must be of the type {signature.parameters[name].annotation}")
         return function(*args, **kwargs)
 
     return checked
