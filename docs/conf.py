@@ -48,7 +48,7 @@ html_theme = "furo"
 html_title = "calstudy"
 html_static_path = ["static"]
 html_css_files = ["dark.css"]
-html_search_scorer = "static/search.js"
+html_search_scorer = str(Path(__file__).parent / "static" / "search.js")
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
