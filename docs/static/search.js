@@ -1,6 +1,6 @@
-// Order of search results: pages come before the Python reference. The numbers are Sphinx's own.
+// Order of search results: user pages, then results and others, then the Python reference. The numbers are Sphinx's own.
 var Scorer = {
-  score: ([page, , , , score]) => (page.startsWith("docs/api/") ? score - 1000 : score),
+  score: ([page, , , , score]) => score - (page.startsWith("docs/api/") ? 2000 : /^(docs|notebooks)\//.test(page) ? 0 : 1000),
   objNameMatch: 11,
   objPartialMatch: 6,
   objPrio: { 0: 15, 1: 5, 2: -5 },
