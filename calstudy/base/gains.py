@@ -201,6 +201,11 @@ def solution_times(cal: UVCal) -> np.ndarray:
     return cal.time_array if cal.time_array is not None else cal.time_range.mean(axis=1)
 
 
+def closest_solutions(cal: UVCal, times: np.ndarray) -> np.ndarray:
+    """Return the index of the integration of gains that is closest to each time, Julian dates, (Ntimes,)."""
+    return np.abs(solution_times(cal)[None] - times[:, None]).argmin(axis=1)
+
+
 def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, width: float) -> None:
     """Raise InputError if gains are delays, or lack antennas (numbers) or channels (Hz, to a tenth of `width`)."""
     if cal.cal_type != "gain" or cal.wide_band:

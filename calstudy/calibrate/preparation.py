@@ -11,7 +11,7 @@ from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
-from calstudy.base.gains import gains_for, solution_times
+from calstudy.base.gains import closest_solutions, gains_for
 from calstudy.base.observation import Observation
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
@@ -212,8 +212,7 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
     """
     if gains is None:
         return np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
-    closest = np.abs(solution_times(gains)[None] - data.times[:, None]).argmin(axis=1)
-    values = gains_for(gains, data.uvd)[:, :, closest]
+    values = gains_for(gains, data.uvd)[:, :, closest_solutions(gains, data.times)]
     known = np.isfinite(values) & (values != 0)
     if not known.any():
         raise InputError("gains: all are flagged, zero or not finite; take others, or none to start from unity")

@@ -376,7 +376,7 @@ class GainFit(WeightedFit):
         return False
 
     @property
-    def unexpected(self) -> str | None:
+    def not_in_expected_loss(self) -> str | None:
         """Field whose effect on the residual the expected loss of the fit lacks; None: there is none."""
         return next((name for name in ("smooth_gains", "baselines") if getattr(self, name) is not None), None)
 

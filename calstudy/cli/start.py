@@ -161,8 +161,8 @@ def _proposed(facts: Facts, whole: str, paths: tuple[Path, ...]) -> dict[str, st
     if lost := uncorrelated(data):
         kept = [number for number in facts.frame.numbers.tolist() if number not in lost]
         antennas = (
-            f"# All but {', '.join(map(str, lost))}, whose cross-correlations, but for one at most, are zero, flagged "
-            f"or noise; without this line: all.\n    antennas: {','.join(map(str, kept))}"
+            f"# All but {', '.join(map(str, lost))}, of whose cross-correlations at most one is above the noise; "
+            f"without this line: all.\n    antennas: {','.join(map(str, kept))}"
         )
     found = quiet_band(data)
     if found is None:

@@ -59,9 +59,9 @@ NOT_OF_THE_FIT = ("pairs", "redundancy_tolerance", "coherent_time")
 
 @memoize
 def expected_loss(graph: Graph) -> Task:
-    """Return the task that predicts T for the middle integration; raises InputError if it would be another."""
+    """Return the task that predicts T for the middle integration; InputError for smoothed gains or a baseline range."""
     fit = graph.experiment.calibration
-    if isinstance(fit, GainFit) and (field := fit.unexpected):
+    if isinstance(fit, GainFit) and (field := fit.not_in_expected_loss):
         raise InputError(
             f"figure 'expected-loss': needs a fit without calibration.{field}, whose effect on the residual the "
             "expected loss lacks; leave out one of the two"

@@ -121,7 +121,7 @@ def transfer(graph: MeasuredGraph) -> Task | None:
 def expected_loss(graph: MeasuredGraph) -> Task | None:
     """Return the task that predicts T for the middle solve; None without a fit by least squares, used as it is."""
     calibrator = graph.experiment.calibration
-    if not isinstance(calibrator, GainFit) or calibrator.unexpected:
+    if not isinstance(calibrator, GainFit) or calibrator.not_in_expected_loss:
         return None
     power = graph.experiment.power.with_defaults(*NOT_OF_THE_FIT)
     return ExpectedLossOfData(LABEL, power=power, **_of_data(graph, "even"))

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 MEDIAN_OVER_MEAN = np.log(2)
 ABOVE_NOISE = 2.0
 """Antennas with a baseline of more than so many times the median power of noise correlate with another."""
-MANY = 4
+TYPICAL_PARTNERS = 4
+"""Where the median antenna correlates with so many others, one with a single other has cross-talk, and sees no sky."""
 
 
 def radiometer_variance(data: UVData, pairs: np.ndarray, polarization: int) -> np.ndarray | None:
@@ -79,9 +80,7 @@ def sample_noise(data: UVData) -> float | None:
 
 
 def uncorrelated(data: UVData) -> list[int]:
-    """Return the numbers of antennas without a cross-correlation above the noise: zero, flagged, or noise alone.
-
-    Where antennas correlate with `MANY` others, one with a single other does so by cross-talk, not by the sky.
+    """Return the numbers of antennas that see no sky: their cross-correlations are zero, flagged, noise or cross-talk.
 
     Of noise alone is a baseline whose median of |V|^2 / sigma^2, by the radiometer equation, is less than `ABOVE_NOISE`
     times that of noise. None are named if they were half of all: then the data are no measure of them. `data` are
@@ -99,7 +98,7 @@ def uncorrelated(data: UVData) -> list[int]:
             seen[:, polarization] &= medians > ABOVE_NOISE * MEDIAN_OVER_MEAN
     numbers = np.unique(pairs)
     counts = np.bincount(np.searchsorted(numbers, pairs[seen.any(axis=1)]).ravel(), minlength=numbers.size)
-    lost = numbers[counts <= (np.median(counts) >= MANY)]
+    lost = numbers[counts <= (1 if np.median(counts) >= TYPICAL_PARTNERS else 0)]
     return lost.tolist() if 2 * lost.size < numbers.size else []
 
 

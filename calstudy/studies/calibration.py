@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from rich.console import Console
 from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
-from calstudy.base.gains import gain_products, solutions
+from calstudy.base.gains import closest_solutions, gain_products, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
@@ -198,7 +198,7 @@ class DataCalibration(DataStudy):
         fit = content.calibration
         if content.expected_loss and not isinstance(fit, GainFit):
             raise InputError(f"expected_loss: is known for fits by least squares, and {fit.label} is none")
-        if content.expected_loss and isinstance(fit, GainFit) and (field := fit.unexpected):
+        if content.expected_loss and isinstance(fit, GainFit) and (field := fit.not_in_expected_loss):
             raise InputError(
                 f"expected_loss: lacks the effect of calibration.{field} on the residual; leave out one of the two"
             )
@@ -267,13 +267,13 @@ class DataCalibration(DataStudy):
         """Return a sentence if the data have antennas, channels or single samples without a gain to start from."""
         facts = self.data.facts[WHOLE]
         values, flags = solutions(gains, self.frames[0].numbers, facts.frequencies, np.array(facts.polarizations))
-        unknown = flags | ~np.isfinite(values) | (values == 0)
+        unknown = (flags | ~np.isfinite(values) | (values == 0))[:, :, closest_solutions(gains, facts.times)]
         antennas = unknown.all(axis=(1, 2, 3))
         channels = unknown[~antennas].all(axis=(0, 2, 3))
         samples = unknown[~antennas][:, ~channels]
         counts = {"antennas": antennas, "channels": channels, "other gains": samples}
         told = [f"{of.sum()} of {of.size} {name}" for name, of in counts.items() if of.any()]
-        return [f"No gains to start from are known for {' and '.join(told)}; these start from unity."] if told else []
+        return [f"No gains to start from are known for {', '.join(told)}; these start from unity."] if told else []
 
     @property
     def start(self) -> Path | None:
@@ -306,8 +306,10 @@ class DataCalibration(DataStudy):
             publish([made.products[task.key] for task in self.targets], work)
             solution = self._solution(made, read_json(work / SOLUTION), read_json(work / QUALITY)[WHOLE])
             if self.start is not None:
-                gains = read_gains(self.start, "calibration.initial_gains.path", UVCal.from_file(work / GAINS))
-                solution["notes"] += self._without_start(gains)
+                # A file that was removed since does not cost the results.
+                with suppress(InputError):
+                    gains = read_gains(self.start, "calibration.initial_gains.path", UVCal.from_file(work / GAINS))
+                    solution["notes"] += self._without_start(gains)
             if self.file.gain_errors:
                 for record, found in zip(solution["records"], read_json(work / ERRORS)["records"], strict=True):
                     record["gain_errors"] = found

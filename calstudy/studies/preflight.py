@@ -92,10 +92,7 @@ def _needless_limit(experiment: Experiment) -> str:
     kept = [_kept(sky, experiment.instrument.channels) for sky in skies]
     if None in kept or kept[0] != kept[1]:
         return ""
-    return (
-        f"{FIELD}.{limit} = {str(assumed[limit])!r}: assumes the sky that the data have, for none of the {kept[0]} "
-        "sources that it keeps is fainter; the sky model misses none of them"
-    )
+    return f"{FIELD}.{limit} = {str(assumed[limit])!r}: leaves out no source: all {kept[0]} are brighter"
 
 
 def _require_another_sky(experiment: Experiment) -> None:

@@ -310,7 +310,7 @@ def test_gains_that_are_not_known_to_start_from_are_counted(command, data, tmp_p
         assert "No gains to start from" not in command(data, *OPTIONS, "--gains", "gains.calh5", *others)[1]
     gains.flag_array[[1, 3]] = gains.flag_array[:, 5] = gains.flag_array[4, 7, 0] = True
     gains.write_calh5(str(tmp_path / "gains.calh5"), clobber=True)
-    told = "for 2 of 8 antennas and 1 of 64 channels and 1 of 756 other gains; these start from unity."
+    told = "for 2 of 8 antennas, 1 of 64 channels, 1 of 756 other gains; these start from unity."
     for others in (["--dry-run"], ["--output", "out"]):
         code, text = command(data, *OPTIONS, "--gains", "gains.calh5", *others)
         assert code == 0

@@ -254,11 +254,11 @@ def test_a_flux_limit_that_is_assumed_and_misses_nothing_is_refused(tmp_path, ca
     assumed = {"sky.foregrounds.flux_limit": "2 Jy"}
     Path("file.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "calibration": {"assumed": assumed}}))
     planned(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 20 Jy}")
-    assert "flux_limit = '2.0 Jy': assumes the sky that the data have" in refused(capsys)
+    assert "flux_limit = '2.0 Jy': leaves out no source" in refused(capsys)
     # Where the sky model is wrong otherwise, it is noted.
     errors = "sky.foregrounds.errors.flux_scale: 1.1"
     told = planned(capsys, "--set", f"calibration.assumed={{sky.foregrounds.flux_limit: 2 Jy, {errors}}}")
-    assert "the sky model misses none of them" in " ".join(told.split())
+    assert "leaves out no source: all 100 are brighter" in " ".join(told.split())
 
 
 def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tmp_path, capsys, monkeypatch):
@@ -270,7 +270,7 @@ def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tm
     Path("file.yaml").write_text(yaml.safe_dump({**tiny(tmp_path), "sky": sky, "calibration": {"assumed": assumed}}))
     planned(capsys)
     told = refused(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")
-    assert "for none of the 3 sources that it keeps" in told
+    assert "leaves out no source: all 3 are brighter" in told
     # A catalogue that was changed is read again.
     Path("sky.csv").write_text("ra,dec,s\n30,-27,9\n31,-26,5\n29,-28,3\n29,-29,1\n")
     planned(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")

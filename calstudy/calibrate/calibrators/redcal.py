@@ -133,7 +133,11 @@ class Redcal(OtherPackage):
             message = (
                 f"omnical found nothing better in {count['stalled']} channels before it converged, and "
                 f"{count['failed']} without a solution are flagged"
-                + ("; firstcal in steps expects gains with phases of cables" if "firstcal" in self.steps else "")
+                + (
+                    "; leave firstcal out of steps if phases of gains are not those of cable delays"
+                    if "firstcal" in self.steps
+                    else ""
+                )
             )
             return Solve(status="stalled", message=message, steps=longest)
         if "omnical" not in self.steps:
