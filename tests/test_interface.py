@@ -75,7 +75,10 @@ def test_a_plan_is_a_table_and_a_mapping(file):
     assert plan.stages.loc["calibrate", "products"] == 4
 
 
-@pytest.mark.parametrize("budget", [{"workers": 0}, {"workers": "2"}, {"max_memory": 6}, {"scheduler": "nonsense"}])
+@pytest.mark.parametrize(
+    "budget",
+    [{"workers": 0}, {"workers": "2"}, {"max_memory": 6}, {"scheduler": "nonsense"}, {"scheduler": 300 * "long"}],
+)
 def test_a_budget_that_is_none_is_refused(file, budget):
     with pytest.raises(InputError, match=f"{next(iter(budget))} = .*must be"):
         calstudy.load(file).run(**budget)

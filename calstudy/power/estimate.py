@@ -55,6 +55,16 @@ class DiagonalPSpecData(PSpecData):
         """
         return all(pol in self.dsets[dset].polarization_array for dset, pol in zip(dsets, pol_pair, strict=True))
 
+    def parse_blkey(self, key: tuple) -> tuple[int, tuple]:
+        """Return the index of the data set and the baseline, with its polarization as an integer.
+
+        pyuvdata looks up the feeds of the telescope for each baseline whose polarization is text, which takes longer
+        than the spectrum.
+        """
+        dset, (first, second, *polarization) = super().parse_blkey(key)
+        numbers = [utils.polstr2num(pol) if isinstance(pol, str) else pol for pol in polarization]
+        return dset, (first, second, *numbers)
+
     def I(self, key: tuple) -> np.ndarray:  # noqa: E743
         """Return the identity (Nfreqs, Nfreqs), one for all baselines."""
         return self._shared(("identity", self.spw_Nfreqs), lambda: np.identity(self.spw_Nfreqs))

@@ -250,7 +250,9 @@ class Budget:
         if self.max_memory is not None and not isinstance(self.max_memory, str):
             raise InputError(f"max_memory = {self.max_memory!r}: must be a text with a unit, such as '6 GB'")
         named, address = str(self.scheduler), r"(\w+://)?\S+:\d+|inproc://\S+"
-        if self.scheduler is not None and not re.fullmatch(address, named) and not Path(named).is_file():
+        # Of a name that is too long, Path.is_file raises OSError.
+        is_file = os.path.isfile(named)  # noqa: PTH113
+        if self.scheduler is not None and not re.fullmatch(address, named) and not is_file:
             raise InputError(
                 f"scheduler = {self.scheduler!r}: must be an address, such as 'tcp://host:8786', or the scheduler file "
                 "that a running dask cluster wrote"

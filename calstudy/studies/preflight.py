@@ -89,10 +89,15 @@ def _needless_limit(experiment: Experiment) -> str:
     skies = [sky.foregrounds for sky in (experiment.sky, assumed_world(experiment).sky)]
     if len({sky.with_defaults("flux_limit", "count", "errors") for sky in skies if isinstance(sky, PointSources)}) != 1:
         return ""
-    kept = [_kept(sky, experiment.instrument.channels) for sky in skies]
-    if None in kept or kept[0] != kept[1]:
+    true, other = skies
+    kept = _kept(true, experiment.instrument.channels)
+    try:
+        used = _kept(other, experiment.instrument.channels)
+    except InputError as error:
+        raise InputError(f"{FIELD}.{error}") from None
+    if kept is None or kept != used:
         return ""
-    return f"{FIELD}.{limit} = {str(assumed[limit])!r}: leaves out no source: all {kept[0]} are brighter"
+    return f"{FIELD}.{limit} = {str(assumed[limit])!r}: leaves out no source: all {kept} are brighter"
 
 
 def _require_another_sky(experiment: Experiment) -> None:

@@ -94,7 +94,7 @@ def test_integrations_without_data_and_gains_that_are_given_have_none_and_say_so
     assert first["realizations"] == 2
     assert second == {"reason": "all gains are flagged"}
     gains = str(tmp_path / "flagged" / "gains.calh5")
-    given = calibrated("given", 2, calibrator="by-file", gains=gains)
+    given = calibrated("given", np.int64(2), calibrator="by-file", gains=gains)
     assert {record["gain_errors"]["reason"] for record in given.solution["records"]} >= {
         "gains do not change with the noise of the data"
     }

@@ -271,6 +271,8 @@ def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tm
     planned(capsys)
     told = refused(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")
     assert "leaves out no source: all 3 are brighter" in told
+    told = refused(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 20 Jy}")
+    assert "calibration.assumed.sky.foregrounds.flux_limit: no source of the catalogue is as bright as 20 Jy" in told
     # A catalogue that was changed is read again.
     Path("sky.csv").write_text("ra,dec,s\n30,-27,9\n31,-26,5\n29,-28,3\n29,-29,1\n")
     planned(capsys, "--set", "calibration.assumed={sky.foregrounds.flux_limit: 2 Jy}")

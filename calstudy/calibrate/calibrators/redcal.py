@@ -21,6 +21,8 @@ from calstudy.instrument.layouts import RedundantGroups, redundant_groups
 from calstudy.instrument.settings import Size
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from hera_cal.datacontainer import DataContainer
     from hera_cal.redcal import RedSol, RedundantCalibrator
 
@@ -266,9 +268,9 @@ class _Redundant:
     def _by_channel(self, first: Gains) -> tuple[Gains, np.ndarray, np.ndarray]:
         """Return gains, those of firstcal included and free of degeneracies, and status and steps of each cell."""
         from hera_cal.datacontainer import DataContainer
-        from hera_cal.redcal import RedSol, RedundantCalibrator
+        from hera_cal.redcal import RedSol
 
-        calibrator = RedundantCalibrator(self.reds)
+        calibrator = _calibrator(self.reds)
         rest = DataContainer(_calibrated(self.data, first))
         floor = NEGLIGIBLE * max(float(values.max()) for values in self.weights.values())
         weights = DataContainer({key: np.maximum(values, floor) for key, values in self.weights.items()})
@@ -331,6 +333,28 @@ class _Redundant:
         data, sky, wgts = (DataContainer(values) for values in (_calibrated(self.data, gains), self.sky, weights))
         scales = abs_amp_lincal(sky, data, wgts=wgts, verbose=False, return_gains=True, gain_ants=list(gains))
         return {key: gain * scales[key] for key, gain in gains.items()}
+
+
+def _calibrator(reds: list[list[tuple[int, int, str]]]) -> RedundantCalibrator:
+    """Return hera_cal's calibrator with an omnical that multiplies the terms of its equations.
+
+    hera_cal evaluates the text of each equation at every step; to compile the text takes longer than the products.
+    """
+    from hera_cal.redcal import OmnicalSolver, RedundantCalibrator
+
+    class Omnical(OmnicalSolver):
+        def _get_ans0(self, sol: Mapping, keys: Any = None, to_update_inplace: dict | None = None) -> dict:
+            values = {**sol, **{f"{name}_": gain.conj() for name, gain in sol.items() if name.startswith("g")}}
+            found = {} if to_update_inplace is None else to_update_inplace
+            for key, ((first, second, model),) in zip(self.keys, self.all_terms, strict=True):
+                found[key] = values[first] * values[second] * values[model]
+            return found
+
+    class Calibrator(RedundantCalibrator):
+        def _solver(self, solver: type, *args: Any, **settings: Any) -> Any:
+            return super()._solver(Omnical if solver is OmnicalSolver else solver, *args, **settings)
+
+    return Calibrator(reds)
 
 
 def _power(gains: Gains, key: tuple[int, int, str]) -> np.ndarray:
