@@ -91,7 +91,7 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
     flagging = [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]
     effects = experiment.corruption.effects if variant.effects else ()
     acting = effects or [experiment.corruption.effects[place] for place in flagging]
-    label, seed = "+".join(variant.components), None
+    label, seed = " + ".join(variant.components), None
     if "noise" in variant.components:
         noise = experiment.corruption.noise
         if isinstance(noise, NoNoise):
@@ -100,7 +100,7 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         seed = (own or noise.seeds)[PARITIES.index(parity)]
         label = f"{label} {parity}"
     return Corrupt(
-        f"effects on ({label})" if effects else label,
+        f"corrupted data ({label})" if effects else label,
         components=sorted(variant.components),
         instrument=_antennas(graph, acting),
         noise_seed=seed,

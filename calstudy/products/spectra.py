@@ -42,7 +42,7 @@ def average(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of one realization ("even" or "odd") of a variant, fringe-stopped and averaged over the run."""
     make = calibration.calibration if variant.calibrate else corruption.data
     source = make(graph, variant, parity)
-    label = f"R of {source.label}" if variant.calibrate else source.label
+    label = f"residual of {source.label}" if variant.calibrate else source.label
     file = RESIDUAL if variant.calibrate else DATA
     times = graph.experiment.instrument.times
     count = graph.experiment.power.n_blocks(times.integration * times.count, times.integration)

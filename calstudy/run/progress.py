@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,18 +20,6 @@ def duration(seconds: float) -> str:
     if seconds < 5400:
         return f"{seconds / 60:.0f} min"
     return f"{seconds / 3600:.1f} h"
-
-
-WORDS = {r"\bR of ": "residual of ", r"\beffects on ": "corrupted data ", r"(?<=\w)\+(?=\w)": " + "}
-"""Parts of labels of products, and the words for them that a run shows."""
-
-
-def described(task: Task) -> str:
-    """Return the stage of a task and its product in words."""
-    label = task.label
-    for part, words in WORDS.items():
-        label = re.sub(part, words, label)
-    return f"{task.stage.name}: {label}"
 
 
 PLANNED_SECONDS = 60.0
@@ -78,7 +65,9 @@ def report(
             count += 1
             left = duration(forecast.finish(task.key))
             seconds = duration(product.record["seconds"])
-            console.print(f"[{count}/{len(tasks)}] {described(task)} ({seconds}), about {left} left", markup=False)
+            console.print(
+                f"[{count}/{len(tasks)}] {task.stage.name}: {task.label} ({seconds}), about {left} left", markup=False
+            )
 
         yield line
         return
@@ -98,6 +87,8 @@ def report(
             nonlocal made
             made += 1
             left = f"about {duration(forecast.finish(task.key))} left"
-            progress.update(bar, completed=forecast.fraction, made=made, left=left, description=described(task))
+            progress.update(
+                bar, completed=forecast.fraction, made=made, left=left, description=f"{task.stage.name}: {task.label}"
+            )
 
         yield advance

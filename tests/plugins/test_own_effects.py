@@ -77,7 +77,7 @@ def test_effects_happen_to_the_data_in_their_order(plugged):
              (("clean", clean), ("dirty", dirty)) for parity in ("even", "odd")}  # fmt: skip
     truth, gains = corruption.truths(graph)[0], corruption.gains(graph)
     products = make([*tasks.values(), gains], plugged.folder)
-    assert tasks["dirty", "even"].label == "effects on (foregrounds+eor+noise even)"
+    assert tasks["dirty", "even"].label == "corrupted data (foregrounds + eor + noise even)"
     data = {name: read_visibilities(products[task.key].path / "data.uvh5") for name, task in tasks.items()}
     drawn = corruption.read_truth(products[truth.key].path)
     template = data["clean", "even"]

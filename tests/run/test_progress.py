@@ -1,7 +1,5 @@
 """How long a run still takes, as it is told while it goes."""
 
-from types import SimpleNamespace
-
 import pytest
 
 from calstudy.run import progress
@@ -40,19 +38,3 @@ def test_the_part_that_is_made_is_that_of_the_costs(monkeypatch):
     forecast = progress.Forecast({"long": 90.0, "short": 10.0}, 1)
     forecast.finish("long")
     assert forecast.fraction == pytest.approx(0.9)
-
-
-@pytest.mark.parametrize(
-    ("label", "words"),
-    [
-        (
-            "R of effects on (foregrounds+eor+noise odd)",
-            "residual of corrupted data (foregrounds + eor + noise odd)",
-        ),
-        ("data + eor even", "data + eor even"),
-        ("EoR of one", "EoR of one"),
-    ],
-)
-def test_products_are_told_in_the_words_of_the_field(label, words):
-    task = SimpleNamespace(stage=SimpleNamespace(name="average"), label=label)
-    assert progress.described(task) == f"average: {words}"

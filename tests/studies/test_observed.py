@@ -75,9 +75,9 @@ def product(run: Run, stage: str, label: str) -> Path:
     )
 
 
-def measurement(run: Run, parity: str, components: str = "foregrounds+eor+noise") -> UVData:
+def measurement(run: Run, parity: str, components: str = "foregrounds + eor + noise") -> UVData:
     """One measurement of the simulation, gains and noise included."""
-    path = product(run, "corrupt", f"effects on ({components} {parity})") / DATA
+    path = product(run, "corrupt", f"corrupted data ({components} {parity})") / DATA
     return UVData.from_file(path, file_type="uvh5", run_check=False)
 
 

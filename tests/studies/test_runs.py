@@ -83,7 +83,7 @@ def test_a_run_leaves_figures_tables_manifest_and_a_file_that_reads_back(finishe
 
 
 def test_products_are_in_standard_formats(finished):
-    label = "effects on (foregrounds+eor+noise even)"
+    label = "corrupted data (foregrounds + eor + noise even)"
     assert UVData.from_file(product_of(finished, "simulate", "foregrounds") / "visibilities.uvh5").Nbls == 21
     assert UVCal.from_file(product_of(finished, "calibrate", label) / "gains.calh5").Ntimes == 2
 

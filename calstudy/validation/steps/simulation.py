@@ -216,7 +216,7 @@ class Foregrounds(Step):
             "both": ("foregrounds", "eor"),
         }
         return {
-            name: spectra.variant_power(graph, "+".join(parts), Variant(components=parts))
+            name: spectra.variant_power(graph, " + ".join(parts), Variant(components=parts))
             for name, parts in components.items()
         }
 
