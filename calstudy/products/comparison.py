@@ -110,10 +110,10 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=8):
+class Comparison(Task, stage="comparison", version=9):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
 
-    The CSV has the fields that worlds change since version 8.
+    The table has C beside T since version 9.
     """
 
     title: str
@@ -230,13 +230,14 @@ def _markdown(
         "",
         "T is the part of the EoR's power that is left, and the bias the power of the residual without EoR over that "
         "of the EoR, both free of the flux scale s, outside the wedge, in bands of k in h/Mpc, with one standard "
-        "deviation. *Linear* is T of the linear response of the fit, where T differs from it by more than its error. "
-        "The gain error is the median over antennas and integrations of the rms over channels, "
-        "free of what no fit can know, and as fitted. χ² is per sample of data that were not fitted, in units of the "
-        "noise. The processor time of an integration, all polarizations and threads together, is the median over "
-        "solves, so that compilation in the first does not decide. The memory is the largest resident memory of the "
-        "process that solved, libraries and what earlier work left included: an upper bound, but for programs that a "
-        "calibrator starts (DP3), which are not in it.",
+        "deviation. Where T differs from them by more than its error, it has beside it C, the coefficient of the "
+        "regression of the response on the EoR, which equals T at the minimum of a fit of free foregrounds and is "
+        "larger with a finite prior, and *linear*, T of the linear response of the fit. The gain error is the median "
+        "over antennas and integrations of the rms over channels, free of what no fit can know, and as fitted. χ² is "
+        "per sample of data that were not fitted, in units of the noise. The processor time of an integration, all "
+        "polarizations and threads together, is the median over solves, so that compilation in the first does not "
+        "decide. The memory is the largest resident memory of the process that solved, libraries and what earlier "
+        "work left included: an upper bound, but for programs that a calibrator starts (DP3), which are not in it.",
         "",
         "Calibrators see the same sky, gains and noise, so that a difference of two is known better than either: the "
         "errors of differences are found by leaving out the same antennas in both. The best in a band has the largest "
@@ -327,15 +328,16 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _transfer_cell(band: Mapping[str, Any]) -> str:
-    """Write T and, if it differs from the linear response by more than its error, this as well."""
-    transfer, error, linear = band["transfer"], band["transfer_error"], band.get("linear_transfer")
+    """Write T, and of C and the linear response those that differ from it by more than its error."""
+    transfer, error = band["transfer"], band["transfer_error"]
     cell = _cell(transfer, error)
-    if transfer is None:
-        return cell
-    unknown = linear is None or error is None or not is_measured(transfer, error)
-    if unknown or abs(transfer - linear) <= error:
-        return marked(cell, transfer, error)
-    return f"{cell} (linear {linear:.2f})"
+    if transfer is None or error is None or not is_measured(transfer, error):
+        return cell if transfer is None else marked(cell, transfer, error)
+    others = {"C": band.get("cross_transfer"), "linear": band.get("linear_transfer")}
+    differ = [
+        f"{name} {value:.2f}" for name, value in others.items() if value is not None and abs(transfer - value) > error
+    ]
+    return f"{cell} ({', '.join(differ)})" if differ else cell
 
 
 def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:

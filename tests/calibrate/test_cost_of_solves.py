@@ -16,7 +16,6 @@ from calstudy.calibrate.interface import Calibration, Calibrator, Solve
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.products.calibration import read_result
-from calstudy.products.comparison import score_table
 from calstudy.products.files import GAINS, MODEL, RESIDUAL, SOLUTION, write_json, write_visibilities
 from calstudy.products.score import cpu_seconds_per_integration
 
@@ -141,17 +140,3 @@ def test_an_integration_costs_the_median_of_all_solves_times_the_polarizations()
     assert cpu_seconds_per_integration([*others, record(None)]) is None
     old = {name: value for name, value in first.items() if name != "cpu_seconds"}
     assert cpu_seconds_per_integration([*others, old]) is None
-
-
-def test_a_table_has_no_processor_time_of_scores_that_do_not_tell():
-    band = dict.fromkeys(("transfer", "transfer_error", "bias", "bias_error"), 0.5) | {"k": [0.1, 0.2]}
-    scores = dict.fromkeys(("flux_scale", "gain_error_aligned", "gain_error_as_fitted", "held_out_chi_squared"))
-    scores |= {"bands": [band], "by_status": {"converged": 1}}
-    new = scores | {"cpu_seconds_per_integration": 0.123, "peak_memory": 2e9}
-    old = scores | {"seconds_per_integration": 4.5, "peak_memory": 2e9}
-    by_file = scores | {"cpu_seconds_per_integration": None, "peak_memory": None}
-    table = score_table({"new": new, "old": old, "by file": by_file})
-    place = table.columns.index("CPU s per integration")
-    assert table.columns[place + 1] == "memory"
-    assert [row[place] for row in table.rows] == ["0.12", "-", "-"]
-    assert [row[place + 1] for row in table.rows] == ["2.0 GB", "2.0 GB", "-"]
