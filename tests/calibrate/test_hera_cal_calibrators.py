@@ -152,6 +152,19 @@ def test_cells_with_the_same_weights_are_solved_together(monkeypatch):
     np.testing.assert_allclose(together, apart, rtol=1e-10)
 
 
+def test_omnical_is_that_of_hera_cal(monkeypatch):
+    """Of noisy data, with unequal weights, it takes the same steps to the same gains."""
+    toy = make_toy(HEX, noise=1e-2)
+    uvd, found = make_uvdata(toy), {}
+    for make in (redcal._calibrator, RedundantCalibrator):
+        monkeypatch.setattr(redcal, "_calibrator", make)
+        result = run_calibrator(Redcal(), uvd, sky_of(uvd, toy.foregrounds))
+        found[make] = result.gains.gain_array, [solution.steps for solution in result.solutions]
+    (ours, our_steps), (theirs, their_steps) = found.values()
+    assert our_steps == their_steps
+    np.testing.assert_allclose(ours, theirs, rtol=1e-10)
+
+
 def test_a_pass_after_one_that_converged_starts_from_its_gains(monkeypatch):
     """All steps of every pass lead to the same gains: here with baselines that are redundant to some percent."""
     toy = make_toy(LARGE_HEX, noise=0.0)
