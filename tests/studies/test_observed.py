@@ -141,7 +141,7 @@ def two_files(simulated, folder) -> Run:
 def one_file(simulated, folder) -> Run:
     """Interleaved integrations of data without EoR, with autocorrelations; the EoR of the simulation is injected."""
     path = folder / "one.uvh5"
-    with_autos(simulated, measurement(simulated, "even", "foregrounds+noise")).write_uvh5(path)
+    with_autos(simulated, measurement(simulated, "even", "foregrounds + noise")).write_uvh5(path)
     observed = {"data": str(path)}
     injection = {"eor": {"nside": 32}, "level": "-30 dB", "simulation": {"chunks": 1}}
     return run_study(load_study(observed_file(folder, "one-file", observed, injection=injection)), Budget(workers=1))
