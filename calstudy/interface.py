@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, wraps
 from html import escape
 from io import StringIO
-from numbers import Integral, Real
+from numbers import Integral
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin, get_type_hints
@@ -77,10 +77,6 @@ SMOOTHING = ("smooth_gains", "gain_delay", "smoothness")
 """Fields of calibrators that make gains smooth."""
 
 
-NUMBERS: dict[type, type] = {int: Integral, float: Real}
-"""What counts as a number: those of numpy as well."""
-
-
 def _typed(function: Callable[P, R]) -> Callable[P, R]:
     """Refuse arguments of other types than the function's own, with a sentence that names the argument."""
     signature = inspect.signature(function)
@@ -89,7 +85,7 @@ def _typed(function: Callable[P, R]) -> Callable[P, R]:
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         hints = get_type_hints(function)
         for name, value in signature.bind_partial(*args, **kwargs).arguments.items():
-            kinds = [NUMBERS.get(kind, get_origin(kind) or kind) for kind in alternatives(hints[name])]
+            kinds = [Integral if kind is int else get_origin(kind) or kind for kind in alternatives(hints[name])]
             if Any not in kinds and not isinstance(value, tuple(kinds)):
                 raise InputError(f"{name} = {value!r}: must be of the type {signature.parameters[name].annotation}")
         return function(*args, **kwargs)
