@@ -109,7 +109,7 @@ def coloured(text: str) -> str:
 
 
 def number(value: float, uncertainty: float | None = None) -> str:
-    """Write a number with three digits, or with its uncertainty and the digits that are significant for it."""
+    """Write a number with three digits, or with its uncertainty and both to two digits of the uncertainty."""
     if not uncertainty:
         return f"{value:.3g}"
     if not math.isfinite(uncertainty):
@@ -117,8 +117,10 @@ def number(value: float, uncertainty: float | None = None) -> str:
     large = LARGE <= abs(value) < math.inf
     places = 1 - math.floor(math.log10(uncertainty)) + (math.floor(math.log10(abs(value))) if large else 0)
     size = f"{value:.{min(15, max(0, places))}{'e' if large else 'f'}}"
-    plain = uncertainty >= 100 and abs(value) < LARGE
-    return f"{size} ± {uncertainty:.0f}" if plain else f"{size} ± {uncertainty:.2g}"
+    if large and uncertainty >= 100:
+        return f"{size} ± {uncertainty:.1e}"
+    decimals = max(0, 1 - math.floor(math.log10(uncertainty)))
+    return f"{size} ± {uncertainty:.{min(15, decimals)}f}"
 
 
 def two_digits(value: float) -> str:

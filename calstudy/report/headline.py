@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.base.table import two_digits
+from calstudy.base.table import number, two_digits
 from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
@@ -54,7 +54,7 @@ class Signal:
     def numbers(self) -> list[Number]:
         """The same numbers as text."""
         pair = (self.transfer, self.transfer_error)
-        transfer = marked(_with_error(*pair), *pair)
+        transfer = marked(number(*pair), *pair)
         left = f"part of the EoR's power that is left, {PLACE}"
         if self.linear_transfer is not None:
             transfer += f" (linear response of the fit {self.linear_transfer:.3f})"
@@ -62,7 +62,7 @@ class Signal:
         bias = f"power of the residual without EoR over that of the EoR, {PLACE}; errors by leaving out antennas"
         return [
             Number("T", transfer, left),
-            Number("bias", _with_error(self.bias, self.bias_error), bias),
+            Number("bias", number(self.bias, self.bias_error), bias),
             Number("flux scale", f"{self.scale:.4f}", "of the calibrated data; T and bias are free of it"),
         ]
 
@@ -116,7 +116,7 @@ def measured_numbers(run: RunFolder) -> list[Number]:
         if tuple(band["k"]) == MEASURED_BAND and band["error"] is not None:
             # Runs of earlier versions have no reason.
             why = band.get("not_measured") or why_not_measured(band["transfer"], band["error"])
-            text = f"not measured ({why})" if why else _with_error(band["transfer"], band["error"])
+            text = f"not measured ({why})" if why else number(band["transfer"], band["error"])
             low, high = MEASURED_BAND
             left = f"part of an injected EoR's power that is left, outside the wedge, k of {low:g} to {high:g} h/Mpc"
             numbers.append(Number("T", text, left))
@@ -128,10 +128,3 @@ def _verdicts(claims: Sequence[Verdict]) -> Number | None:
     evaluated = counts(outcome for outcome in outcomes if outcome != "not evaluated")
     meaning = f"sentences of the papers; {len(outcomes)} in all, the others were not evaluated"
     return Number("claims", evaluated, meaning) if evaluated else None
-
-
-def _with_error(value: float, error: float) -> str:
-    if not math.isfinite(error):
-        return f"{two_digits(value)} (error not known)"
-    digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < 10 else 0
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
