@@ -75,8 +75,8 @@ class Boards(Section):
         try:
             kept = 1 - self._losses(gains, self._information(gains, data, sky, found, groups), data)
         except RuntimeError as error:
-            told = f"hera_cal finds no losses between boards: {error}"
-            return replace(found, outcomes=[replace(ended, status="failed", message=told) for ended in found.outcomes])
+            text = f"hera_cal finds no losses between boards: {error}"
+            return replace(found, outcomes=[replace(ended, status="failed", message=text) for ended in found.outcomes])
         closure = np.ones(data.shape)
         between = np.flatnonzero(~self.within(data))
         first, second = data.antennas[between].T

@@ -156,12 +156,12 @@ class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
         together = self.calibration.integrations_per_solve
         times = _times_of_chunk(self.data / DATA, self.index, self.count, together)
         data, sky, noise = self.read(times)
-        told = conspicuous(Observation(data))
+        remarks = conspicuous(Observation(data))
         result = run_calibrator(self.calibration, data, sky, noise=noise)
         result.gains.write_calh5(output / GAINS)
         for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
             write_visibilities(uvd, output / name, single=True)
-        summary = {**result.summary(), "told": told}
+        summary = {**result.summary(), "told": remarks}
         write_json(output / SOLUTION, summary)
         return {"by_status": summary["by_status"]}
 
@@ -190,7 +190,7 @@ class Calibrate(Task, stage="calibrate", version=2):
             write_visibilities(joined, output / name, single=True)
         solutions = [read_json(folder / SOLUTION) for folder in self.chunk]
         records = [record for solution in solutions for record in solution["records"]]
-        told = list(dict.fromkeys(text for solution in solutions for text in solution.get("told", [])))
+        remarks = list(dict.fromkeys(text for solution in solutions for text in solution.get("told", [])))
         records.sort(key=lambda record: (record["polarization"], record["time"]))
         by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
         for record in records:
@@ -203,7 +203,7 @@ class Calibrate(Task, stage="calibrate", version=2):
             "by_status": by_status,
             **({"median_steps": float(np.median(steps))} if steps else {}),
             "median_seconds_per_solve": float(np.median(seconds)),
-            "warnings": told + _warnings(by_status, records),
+            "warnings": remarks + _warnings(by_status, records),
         }
 
     def _cost(self) -> Cost:

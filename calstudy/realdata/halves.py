@@ -202,8 +202,8 @@ def modelled(frame: Frame, path: Path) -> Frame:
     chosen = np.array([frozenset(pair) in known for pair in frame.pairs.tolist()])
     if not (chosen & ~frame.autos).any():
         raise InputError(
-            f"observed.sky_model: {path} has none of the cross-correlations of the data (antennas are told by their "
-            "numbers)"
+            f"observed.sky_model: {path} has none of the cross-correlations of the data (antennas are identified by "
+            "number)"
         )
     return frame.baselines(chosen | frame.autos)
 

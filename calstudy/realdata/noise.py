@@ -154,7 +154,7 @@ def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarra
     """Return P_N of each unit of spectra (baseline or redundant group), (Nu,): the mean over its baselines.
 
     `noise` gives the baselines, and `levels` P_N of each. NaN is left out; units without levels have the mean of all.
-    Baselines are told by their antennas, and those of groups, or of spectra without shares, by their vectors.
+    Baselines are identified by their antennas, and those of groups, or of spectra without shares, by their vectors.
     """
     known = np.isfinite(levels)
     mean = np.mean(levels[known]) if known.any() else np.nan

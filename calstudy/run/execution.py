@@ -77,7 +77,7 @@ class WorkOrder:
         return f"{self.task.stage.name} ({self.task.label})"
 
 
-def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> Product:
+def perform(order: WorkOrder, warn: Callable[[str], None] = logger.warning) -> Product:
     """Make the ordered product, or return it if another run has made it meanwhile.
 
     Raises InputError if the worker has other code, an input was removed or damaged, the stage refuses a value, or the
@@ -95,7 +95,7 @@ def perform(order: WorkOrder, told: Callable[[str], None] = logger.warning) -> P
             "of its packages on all workers, and start them again"
         )
     try:
-        with store.lock(order.task.stage.name, order.key, told):
+        with store.lock(order.task.stage.name, order.key, warn):
             existing = None if order.again else store.verify(order.task.stage.name, order.key)
             return existing if existing is not None else _make(order, store)
     except InputError:
@@ -477,13 +477,13 @@ def execute(
     store: Store,
     workers: Workers,
     done: Callable[[Task, Product], None] = lambda task, product: None,
-    told: Callable[[str], None] = logger.warning,
+    warn: Callable[[str], None] = logger.warning,
     again: Container[str] = (),
 ) -> dict[str, Product]:
     """Make the products of `tasks`, and return them by key.
 
     Tasks are from `schedule`, ordered so that each follows its inputs. The store is on a file system that all workers
-    share. `done` is called after each product, and `told` with a sentence for each wait for the lock of another run.
+    share. `done` is called after each product, and `warn` with a sentence for each wait for the lock of another run.
     Products with keys in `again` are made even if they exist.
 
     Raises InputError if the scheduler cannot be reached or is lost, a worker dies repeatedly, or a stage refuses its
@@ -495,7 +495,7 @@ def execute(
     from distributed import CancelledError, KilledWorker, as_completed
 
     with _client(workers) as client:
-        client.subscribe_topic(WAITS, lambda event: told(event[1]))
+        client.subscribe_topic(WAITS, lambda event: warn(event[1]))
         queue = _Queue(tasks, store, client, again)
         futures = queue.first()
         completed = as_completed(futures)

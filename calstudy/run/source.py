@@ -306,6 +306,6 @@ def _normal(node: Any) -> str:
     for name, value in ast.iter_fields(node):
         if name in UNREAD or value is None or value == [] or (name == "annotation" and isinstance(node, ast.arg)):
             continue
-        told = [item for item in value if not _is_text(item)] if name == "body" and isinstance(value, list) else value
-        parts.append(f"{name}={_normal(told)}")
+        items = [item for item in value if not _is_text(item)] if name == "body" and isinstance(value, list) else value
+        parts.append(f"{name}={_normal(items)}")
     return f"{type(node).__name__}({','.join(parts)})"

@@ -118,11 +118,11 @@ class Store:
         folder = self.folder(stage, key)
         try:
             record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-            told = record.pop(DIGEST)
+            recorded = record.pop(DIGEST)
             sizes = {name: (folder / name).stat().st_size for name in record["files"]}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
-        if told != digest_json(record) or not all(_inside(name) for name in sizes):
+        if recorded != digest_json(record) or not all(_inside(name) for name in sizes):
             return None
         if record.get("key") != key or any(sizes[name] != entry["bytes"] for name, entry in record["files"].items()):
             return None
@@ -180,10 +180,10 @@ class Store:
         return self.root / ".locks" / f"{stage}-{key}.lock"
 
     @contextmanager
-    def lock(self, stage: str, key: str, told: Callable[[str], None] = lambda text: None) -> Iterator[None]:
+    def lock(self, stage: str, key: str, warn: Callable[[str], None] = lambda text: None) -> Iterator[None]:
         """Hold the right to make this product; another run that needs it waits, and then finds it made.
 
-        After a wait of `SILENT_WAIT`, `told` is called with a sentence that names the holder. Raises InputError if
+        After a wait of `SILENT_WAIT`, `warn` is called with a sentence that names the holder. Raises InputError if
         another process holds the lock for `LONGEST_WAIT`, or if the file system has no locks.
         """
         path = self._lock_file(stage, key)
@@ -195,7 +195,7 @@ class Store:
             try:
                 lock.acquire(timeout=SILENT_WAIT)
             except Timeout:
-                told(f"{stage} {key}: waits for the lock {path}, held by {_holder(holder)}")
+                warn(f"{stage} {key}: waits for the lock {path}, held by {_holder(holder)}")
                 lock.acquire(timeout=LONGEST_WAIT)
         except Timeout:
             raise InputError(

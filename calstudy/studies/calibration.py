@@ -272,8 +272,8 @@ class DataCalibration(DataStudy):
         channels = unknown[~antennas].all(axis=(0, 2, 3))
         samples = unknown[~antennas][:, ~channels]
         counts = {"antennas": antennas, "channels": channels, "other gains": samples}
-        told = [f"{of.sum()} of {of.size} {name}" for name, of in counts.items() if of.any()]
-        return [f"No gains to start from are known for {', '.join(told)}; these start from unity."] if told else []
+        found = [f"{of.sum()} of {of.size} {name}" for name, of in counts.items() if of.any()]
+        return [f"No gains to start from are known for {', '.join(found)}; these start from unity."] if found else []
 
     @property
     def start(self) -> Path | None:

@@ -348,11 +348,11 @@ def _make_missing(
             show(task, product)
             lease.drop(lifetimes.after(task))
 
-        def told(text: str) -> None:
+        def warn(text: str) -> None:
             logger.warning(text)
             console.print(text, markup=False)
 
-        products = execute(plan.todo, store, workers, done, told, plan.again)
+        products = execute(plan.todo, store, workers, done, warn, plan.again)
     # Of two runs at once, one finds what the other has made.
     made = tuple(task for task in plan.todo if products[task.key].made)
     return RunProducts({**found_of(unique(targets), store), **products}, made)

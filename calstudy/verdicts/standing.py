@@ -174,12 +174,12 @@ class InBand:
             return f"fails in {', '.join(world.reason for world in decisive[:NAMED])}{more}"
         large = [world.bias_error for world in decisive if not world.upper_limit < self.limit]
         smaller = (SIGMAS + 1) * max(large, default=0.0) / self.limit
-        told = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
-        told = f"errors would have to be over {OUT_OF_REACH:g} times smaller" if smaller > OUT_OF_REACH else told
-        told = told if large else "T is not measured there"
+        cause = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
+        cause = f"errors would have to be over {OUT_OF_REACH:g} times smaller" if smaller > OUT_OF_REACH else cause
+        cause = cause if large else "T is not measured there"
         if not all(math.isfinite(world.upper_limit) for world in decisive):
-            told = "a wider band of k, or more baselines, would tell"
-        return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {told}"
+            cause = "a wider band of k, or more baselines, would tell"
+        return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {cause}"
 
 
 def standings(
