@@ -64,7 +64,7 @@ def test_a_wait_of_a_worker_is_told_to_the_run(store, monkeypatch):
         told.append(text)
         lock.release()
 
-    execute(schedule([task], store).todo, store, Workers(1, store.root / "log"), told=tell)
+    execute(schedule([task], store).todo, store, Workers(1, store.root / "log"), warn=tell)
     assert told[0].startswith(f"number {task.key}: waits for the lock")
 
 
