@@ -595,8 +595,12 @@ class OpenRun:
 
     def _product(self, task: Task, study: Study) -> Path:
         stores = self._stores(study.outputs)
+        # Keys of today differ if code or a file that the run used was changed since.
+        name = (task.stage.name, task.label)
+        keys = [entry["key"] for entry in self._folder.products if (entry["stage"], entry["label"]) == name]
+        key = keys[0] if len(keys) == 1 else task.key
         for store in stores:
-            if (product := store.find(task.stage.name, task.key)) is not None:
+            if (product := store.find(task.stage.name, key)) is not None:
                 return product.path
         raise InputError(
             f"{task.stage.name} ({task.label}): is not in the store {stores[-1].root}, or was made by another version; "

@@ -17,6 +17,7 @@ import calstudy
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
+from calstudy.products.calibration import Calibrate
 from calstudy.report.headline import read_signal
 from calstudy.report.page import write_report
 from calstudy.results.reader import RunFolder
@@ -34,6 +35,12 @@ def file(tmp_path_factory, shared_store):
 @pytest.fixture(scope="module")
 def run(file):
     return calstudy.load(file, **{"outputs.figures": ["wedge", "signal-loss"]}).run(workers=1, quiet=True)
+
+
+def test_a_run_has_its_own_products_after_a_change_of_code(run, monkeypatch):
+    made = run.gains()
+    monkeypatch.setattr(Calibrate, "version", Calibrate.version + 1)
+    assert calstudy.open_run(run.folder).gains() == made
 
 
 def test_the_import_is_light():

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import REVISED, defaults
-from calstudy.base.user_code import digest_file
+from calstudy.base.user_code import digest_file, identity_of_file
 
 
 def identity(value: Any) -> Any:
@@ -20,8 +20,8 @@ def identity(value: Any) -> Any:
     earlier products; a change of a default requires a new version of the stages that read it. A field may have a
     version of its own (`calstudy.base.schema.REVISED`), where only its other values give new results. The tag of a
     choice between blocks is always present unless it is the default choice. An input file is identified by its
-    content, a folder by the names and contents of its files, and a plug-in by the content of its file or
-    the version of its package.
+    content, a Python file also by that of the modules that it imports from its folder, a folder by the names and
+    contents of its files, and a plug-in by its file or the version of its package.
     """
     if isinstance(value, BaseModel):
         return _identity_of_section(value)
@@ -30,7 +30,7 @@ def identity(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [identity(item) for item in value]
     if isinstance(value, Path):
-        return _identity_of_folder(value) if value.is_dir() else f"sha256:{digest_file(value)}"
+        return _identity_of_folder(value) if value.is_dir() else identity_of_file(value)
     return value
 
 

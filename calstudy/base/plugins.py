@@ -24,7 +24,7 @@ from pydantic.json_schema import JsonSchemaValue
 
 from calstudy.base.errors import InputError, nearest
 from calstudy.base.schema import Kinds, Section
-from calstudy.base.user_code import beside_of, digest_file, load_file, user_code
+from calstudy.base.user_code import identity_of_file, load_file, user_code
 
 FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]*))?")
 
@@ -273,10 +273,7 @@ class Registry(Kinds[P]):
         """Return the identity of a plug-in's code: its name or package with a version, or the digest of its file."""
         file = FILE_REFERENCE.fullmatch(reference)
         if file is not None:
-            path = Path(file["path"])
-            beside = {name: digest_file(found) for name, found in beside_of(path).items()}
-            others = "".join(f":{name}={digest}" for name, digest in sorted(beside.items()))
-            return f"sha256:{digest_file(path)}:{file['name'] or ''}{others}"
+            return identity_of_file(Path(file["path"]), f":{file['name'] or ''}")
         if reference in self._modules:
             version = self.find(reference).version
             return reference if version == 1 else f"{reference}@{version}"

@@ -88,6 +88,16 @@ def beside_of(path: Path) -> dict[str, Path]:
     return found
 
 
+def identity_of_file(path: Path, part: str = "") -> str:
+    """Return the identity of a file by its content, and of a Python file by the modules of `beside_of` as well.
+
+    With `part`, of what has this name in it.
+    """
+    beside = beside_of(path) if path.suffix == ".py" else {}
+    others = "".join(f":{name}={digest_file(found)}" for name, found in sorted(beside.items()))
+    return f"sha256:{digest_file(path)}{part}{others}"
+
+
 def _imported(path: Path, in_functions: bool = False) -> Iterator[str]:
     """Yield the names of all modules that a file may import, and of the packages that they are in.
 

@@ -6,6 +6,7 @@ import pytest
 from tiny import tiny
 
 from calstudy.base.identity import identity
+from calstudy.base.user_code import load_function
 from calstudy.corrupt.interface import Effect
 from calstudy.experiment.files import override, validate
 from calstudy.products import calibration, corruption, signal_loss, simulation, spectra
@@ -242,6 +243,22 @@ def test_a_plug_in_counts_with_the_modules_that_it_imports_from_its_folder(tmp_p
     (tmp_path / "parts.py").write_text("half = 0.25\n")
     assert identity(effect()) != before
     assert effect().apply(1.0, None, {}) == 0.25
+
+
+def test_sources_from_code_count_with_the_modules_that_it_imports_from_its_folder(tmp_path):
+    (tmp_path / "fluxes.py").write_text("FLUX = 10.0\n")
+    (tmp_path / "mine.py").write_text("from fluxes import FLUX\n\n\ndef sources(frequencies):\n    return FLUX\n")
+    block = {"kind": "code", "path": "mine.py", "function": "sources"}
+
+    def found() -> tuple[object, float]:
+        settings = validate(override(tiny(tmp_path), "sky.foregrounds", block), tmp_path).sky.foregrounds
+        return identity(settings), load_function(settings.path, "sources")(None)
+
+    before = found()
+    (tmp_path / "fluxes.py").write_text("FLUX = 20.0\n")
+    after = found()
+    assert before[0] != after[0]
+    assert (before[1], after[1]) == (10.0, 20.0)
 
 
 def test_a_calibration_is_one_task_however_many_products_need_it():
