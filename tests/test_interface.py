@@ -39,7 +39,7 @@ def run(file):
 
 def test_a_run_has_its_own_products_after_a_change_of_code(run, monkeypatch):
     made = run.gains()
-    monkeypatch.setattr(Calibrate, "version", Calibrate.version + 1)
+    monkeypatch.setattr(Calibrate, "stage", Calibrate.stage._replace(version=Calibrate.stage.version + 1))
     assert calstudy.open_run(run.folder).gains() == made
 
 
