@@ -165,7 +165,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a changed record is believed",
-        "if told != digest_json(record) or not all(",
+        "if recorded != digest_json(record) or not all(",
         "if not all(",
         STORE,
     ),
@@ -277,7 +277,7 @@ MUTATIONS = (
         'elif value != default and name != "tolerance":\n            content',
         KEYS,
     ),
-    Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, told):", "if True:", STORE),
+    Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, warn):", "if True:", STORE),
     Mutation("verify reads no file", 'sha256(product.path / name) == entry["sha256"]', "True", STORE),
     Mutation("a kept product is dropped", ' and product.record.get("temporary")', "", STORE),
     Mutation(

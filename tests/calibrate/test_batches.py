@@ -74,6 +74,7 @@ def make_problem(toy, case):
 
 # Each kind of fit, and each precision of one of them: compilation takes seconds. One model per baseline gives the same
 # products as models that some share, which are of all baselines; some are turned.
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("case", "dtype"),
     [

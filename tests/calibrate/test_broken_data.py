@@ -285,6 +285,7 @@ def test_data_that_cannot_be_calibrated_are_refused_with_the_reason(name, good, 
     assert reason in complaint(message)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("name", SKIPPED)
 @pytest.mark.filterwarnings("ignore")
 def test_data_without_anything_in_them_are_not_said_to_be_calibrated(name, good, tmp_path, capsys):

@@ -211,6 +211,7 @@ def test_not_converging_is_recorded_not_raised(data):
     assert not result.gains.flag_array.any()
 
 
+@pytest.mark.chain
 def test_adamax_is_one_setting_away(data):
     settings = ONE_SOLVE.model_copy(update={"solver": AdamaxSettings(name="adamax", max_steps=100)})
     ticks = []

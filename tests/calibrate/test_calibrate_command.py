@@ -89,6 +89,7 @@ def test_a_dry_run_says_what_would_be_solved_and_imports_no_tensorflow(data, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["data.uvh5"]
 
 
+@pytest.mark.chain
 def test_the_expected_loss_is_written_and_how_far_the_fit_is_told(command, finished):
     folder, error = finished
     expected = load_spectrum(folder / "out" / "expected-transfer.ee.h5", ExpectedTransfer)
@@ -303,6 +304,7 @@ def test_a_dry_run_refuses_what_the_run_refuses(command, data, tmp_path, argumen
         assert sentence in error
 
 
+@pytest.mark.chain
 def test_gains_that_are_not_known_to_start_from_are_counted(command, data, tmp_path):
     gains = make_uvcal(UVData.from_file(str(data)), np.ones((8, 64, 2, 1), complex))
     gains.write_calh5(str(tmp_path / "gains.calh5"))
@@ -381,6 +383,7 @@ def test_a_disk_that_is_full_is_told_in_a_sentence(command, data, monkeypatch):
     assert "--output out: observe (data whole) could not be written (No space left on device); make room or" in error
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("text", ["prior: none\n", "calibration: {prior: none, solver: {max_steps: 7}}\n", "{}\n"])
 def test_a_settings_file_is_stronger_than_the_defaults_for_measured_data(command, data, tmp_path, text):
     (tmp_path / "settings.yaml").write_text(text)
@@ -433,6 +436,7 @@ def test_gains_have_their_errors_beside_what_other_readers_see(command, finished
         _ = smooth.gain_errors
 
 
+@pytest.mark.chain
 def test_an_antenna_that_cannot_be_calibrated_is_flagged_with_its_number(command, toy, data, tmp_path):
     uvd, rng = UVData.from_file(str(data)), np.random.default_rng(5)
     # The fourth antenna.

@@ -79,6 +79,7 @@ def test_what_is_left_is_orthogonal_to_the_minimum(pair):
     assert early.newton_decrement == pytest.approx(fallen, rel=0.5)
 
 
+@pytest.mark.chain
 def test_every_solver_tells_how_far_it_is(pair):
     problem = pair[0].problem()
     for solver in (GaussNewton(), Adamax(max_steps=300)):
@@ -126,6 +127,7 @@ def drifting_bias(case, solver, integrations, warm_start):
     return ratio_over_antennas(power, reference, simulation.antennas)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("warm_start", [False, True], ids=["cold", "warm"])
 def test_solutions_leave_nothing_in_common_wherever_they_start(warm_start):
     """Each integration from unity, or from the one before."""

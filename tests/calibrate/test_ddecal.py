@@ -78,6 +78,7 @@ def test_too_few_steps_are_no_convergence():
     assert statuses(result) == ["max-steps"]
 
 
+@pytest.mark.chain
 @needs_dp3
 def test_smoothing_averages_noise_down():
     """Gains are smooth here, so that smoothing them over many channels lowers their errors."""

@@ -274,6 +274,7 @@ def test_gains_per_channel_are_those_of_sky_based_calibration(cables):
     assert rms(gain_products(fitted / toy.gains, toy.antennas) - 1) > 0.3 * noise
 
 
+@pytest.mark.chain
 def test_gain_errors_of_order_one_are_within_reach_with_gains_per_channel():
     """Within 1 % of the loss that is reached from the true gains, with a quarter of another sky in the sky model.
 

@@ -142,6 +142,7 @@ class DenseLikelihood:
         return float(np.mean(np.sum(self.jacobian**2, axis=0)))
 
 
+@pytest.mark.chain
 def test_the_deviations_are_the_most_likely_ones():
     problem, solution, found = settled(measured(HEX, "both", (0.01, 0.05), 2))
     likelihood, best, error = DenseLikelihood(problem, solution), np.log(found.deviations), np.array(found.error)
@@ -188,6 +189,7 @@ def test_a_level_that_is_not_there_vanishes_and_leaves_the_other_at_its_maximum(
     assert abs(slope / curvature) < 1.5
 
 
+@pytest.mark.chain
 def test_levels_that_are_the_same_do_not_end_in_an_error():
     """Without redundant baselines own and shared errors are one, and their powers add up."""
     for seed in (1, 2):

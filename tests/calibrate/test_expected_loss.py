@@ -86,6 +86,7 @@ def case(kind):
 KINDS = ["any gains", "flags", "smooth gains", "redundant"]
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("kind", KINDS)
 def test_exact_diagonal_is_that_of_the_projector_on_all_tangent_vectors(kind):
     problem, gains, model = case(kind)
@@ -174,6 +175,7 @@ def dense_residual_power(problem, gains, model):
     return found
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     "prior", [*(pytest.param(prior, marks=pytest.mark.slow) for prior in ("own", "shared")), "both"]
 )

@@ -394,6 +394,7 @@ def changing():
     return toy, measured, model, NOISE * rms
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("calibrator", [DelayWeighted, Unified], ids=["delay-weighted", "unified"])
 def test_integrations_and_polarizations_have_priors_of_their_own(changing, calibrator):
     """What is solved after another integration, from its gains, is what is solved by itself, to the tolerance.
@@ -417,6 +418,7 @@ def test_integrations_and_polarizations_have_priors_of_their_own(changing, calib
     assert np.sqrt(np.mean(np.abs(excess) ** 2)) < 0.03 * sigma
 
 
+@pytest.mark.chain
 def test_integrations_that_are_solved_together_know_their_gains_better(changing):
     toy, data, model, sigma = changing
     true = gain_products(toy.gains, toy.antennas)

@@ -191,6 +191,7 @@ def test_errors_are_too_small_where_the_page_says_so(toy, settings, part):
     assert covered(pulls(toy, **settings)[part])[0] < RIGHT[0] - 0.05
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("toy", "kind", "flagged"),
     [

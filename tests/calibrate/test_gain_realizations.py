@@ -102,6 +102,7 @@ def test_integrations_without_data_and_gains_that_are_given_have_none_and_say_so
         _ = given.gain_errors
 
 
+@pytest.mark.chain
 @pytest.mark.filterwarnings("ignore")
 def test_gains_of_measured_data_have_them_if_asked_for(calibrated):
     found = calibrated("with", 3)
@@ -115,6 +116,7 @@ def test_gains_of_measured_data_have_them_if_asked_for(calibrated):
     assert "is no fit by least squares" in reason
 
 
+@pytest.mark.chain
 @pytest.mark.filterwarnings("ignore")
 def test_fits_with_a_taper_have_them_by_realizations_alone(calibrated):
     settings = {"calibrator": "sky-based", "weights": "flags", "baselines": {"taper": "20 m"}}
@@ -123,6 +125,7 @@ def test_fits_with_a_taper_have_them_by_realizations_alone(calibrated):
     assert calibrated("realizations", 2, **settings).solution["records"][0]["gain_errors"]["realizations"] == 2
 
 
+@pytest.mark.chain
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("realizations", [True, pytest.param(8, marks=pytest.mark.chain)])
 def test_an_integration_without_data_changes_no_errors_of_gains_that_it_shares(calibrated, realizations):
@@ -145,6 +148,7 @@ SMOOTH = [
 ]
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(("field", "settings"), SMOOTH)
 @pytest.mark.filterwarnings("ignore")
 def test_errors_of_smooth_gains_are_not_drawn_for_each_channel_by_itself(calibrated, field, settings):

@@ -176,6 +176,7 @@ def test_weights_that_run_away_leave_the_deviation_that_equal_weights_estimate()
     assert np.allclose(weighted.gains.gain_array, equal.gains.gain_array, rtol=1e-3)
 
 
+@pytest.mark.chain
 def test_weights_that_run_away_leave_nothing_to_the_next_integration():
     """Each integration starts from the one before, whose gains, lost in noise, must not decide its weights."""
     toy = make_toy(scattered(8), noise=0.4)

@@ -142,6 +142,7 @@ def floors():
     return floor
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("with_sky", [True, False], ids=["sky model", "no sky model"])
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in CASES])
 def test_the_minimum_is_found_from_delays(name, with_sky, floors):

@@ -86,6 +86,7 @@ def flagged_before(name: str, antennas: np.ndarray, shape: tuple[int, ...]) -> n
     return flags
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     "name",
     ["a dead antenna", "a gap", "half of the integrations", "edges of coarse channels", "channels of an antenna"],

@@ -148,6 +148,7 @@ def test_pieces_of_any_size_give_the_same_projection():
         assert np.abs(other.descent - results[2].descent).max() < 1e-9 * np.abs(results[2].descent).max()
 
 
+@pytest.mark.chain
 def test_gaps_in_frequency_are_flagged_channels(toy):
     from toy import BASIS
 

@@ -71,6 +71,7 @@ def test_with_weights_from_the_gains_the_misfit_of_the_groups_stays_in_the_wedge
     assert window_rms(True, True, "calamity-redundant", "gains") < 1.3
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("weights", ["gains", "flags"])
 def test_one_model_per_baseline_does_not_care(window_rms, weights):
     assert window_rms(True, True, "calamity", weights) < 1.3

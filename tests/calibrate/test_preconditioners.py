@@ -71,6 +71,7 @@ def blocks(request, toy):
     return projector, projection, gains, antenna_blocks(projector, projection)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("antenna", [0, 7])
 def test_blocks_are_those_of_the_hessian_on_the_common_basis(blocks, antenna):
     projector, projection, _, found = blocks
@@ -183,6 +184,7 @@ def coupled(request):
     return Coupled(small.problem(structure))
 
 
+@pytest.mark.chain
 def test_coupled_blocks_are_the_hessian_on_the_common_basis(coupled):
     expected = coupled.common.T @ coupled.hessian @ coupled.common
     found = coupled.blocks.matrix(coupled.ends)
@@ -205,6 +207,7 @@ def test_coupled_inverse_is_the_formula_of_the_module(coupled):
     assert np.abs(coupled.inverse(DAMPING) - expected).max() < 1e-9 * np.abs(expected).max()
 
 
+@pytest.mark.chain
 def test_coupled_blocks_resolve_what_those_of_each_antenna_do_not(coupled):
     """Conjugate gradients with both, at a damping far below what single precision resolves."""
     rng, damping = np.random.default_rng(8), 1e-11

@@ -212,6 +212,7 @@ def test_a_killed_calibration_is_resumed_and_gives_what_an_undisturbed_one_gives
     assert not list((files / "cut").glob(".unfinished*"))
 
 
+@pytest.mark.chain
 @pytest.mark.filterwarnings("ignore")
 def test_interference_is_warned_of_and_written(files, clean, capsys):
     spoiled = clean.copy()

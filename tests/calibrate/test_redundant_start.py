@@ -48,6 +48,7 @@ def test_gains_are_right_up_to_what_redundancy_cannot_know(hexagon):
         assert np.abs(members / members[0] - 1).max() < 5e-3
 
 
+@pytest.mark.chain
 def test_long_cables_are_within_reach_of_the_fit_from_there_but_not_from_unity(hexagon):
     data, settings, _ = start_of(hexagon, delays=True)
     near, far = run_calibrator(settings, data).solutions[0], run_calibrator(ONE_SOLVE, data).solutions[0]

@@ -63,6 +63,7 @@ def modes(way, observation) -> float:
     return total / 300
 
 
+@pytest.mark.chain
 def test_smooth_gains_stay_as_they_are(way, observation):
     rng = np.random.default_rng(2)
     gains = (3 + 0.1 * low(FREQUENCIES.size, rng))[:, :, None] + 0.1j * low(N_TIMES, rng)[:, None, :]

@@ -89,6 +89,7 @@ def test_divergence_is_reported_as_failure(toy):
     assert "not finite" in solution.record.message
 
 
+@pytest.mark.chain
 def test_best_parameters_are_kept(toy):
     problem = toy.problem(prior="none")
     solution = solve(problem, Adamax(learning_rate=0.3, max_steps=6, precision="double"))
@@ -231,6 +232,7 @@ def test_a_sky_model_of_zero_has_no_slope_and_no_scale(quiet):
         fix_degeneracies(quiet.gains, quiet.foregrounds, problem)
 
 
+@pytest.mark.chain
 def test_errors_of_the_models_do_not_average_out_of_their_sum():
     """The scale by the paper's prior scatters with the gains, far more than by a regression on the same sky model.
 
@@ -329,6 +331,7 @@ def test_a_plateau_is_not_taken_for_the_minimum(toy, gained, predicted, converge
     assert (verdict is not None and verdict.status == "converged") == converged
 
 
+@pytest.mark.chain
 def test_double_precision_goes_on_where_single_precision_stops(quiet):
     """Exact data: the only minimum is zero."""
     problem = quiet.problem(visibilities=gain_products(quiet.gains, quiet.antennas) * in_the_span(quiet))
@@ -376,6 +379,7 @@ def test_single_precision_says_where_it_does_not_reach(noise):
     assert 0.01 < single.record.newton_decrement < fall
 
 
+@pytest.mark.chain
 def test_warm_starts_say_what_cold_ones_say():
     """One step from the solution before is enough for the loss, but not for the directions that damping hides."""
     simulation, structure = golomb(noise=1e-5, eor=1e-4)
@@ -426,6 +430,7 @@ def jacobian(problem, gains):
     return np.concatenate([residual.real, residual.imag], None), np.concatenate([flat.real, flat.imag])
 
 
+@pytest.mark.chain
 def test_derivatives_of_gains_that_foregrounds_can_follow_are_not_rounding():
     """Where singular values are tiny, the rounding of the residual has a larger part that foregrounds absorb."""
     small = make_toy(scattered(6), noise=0.0)
@@ -444,6 +449,7 @@ def test_derivatives_of_gains_that_foregrounds_can_follow_are_not_rounding():
     assert np.linalg.norm(error) < 1e-3 * np.linalg.norm(value)
 
 
+@pytest.mark.chain
 def test_warm_starts_in_double_precision_go_on_as_far_as_cold_ones():
     """With little noise both go on in double precision, with geodesic acceleration."""
     small, rng = make_toy(scattered(6), noise=0.0), np.random.default_rng(3)
@@ -468,6 +474,7 @@ def test_what_double_precision_leaves_is_not_said_to_be_nothing():
     assert found.record.decrement_rms > 0
 
 
+@pytest.mark.chain
 def test_a_spoiled_preconditioner_is_not_taken_for_the_minimum(monkeypatch):
     """Blocks that rounding has left indefinite promise nothing in a check of convergence."""
     small = make_toy(scattered(6), noise=1e-5)

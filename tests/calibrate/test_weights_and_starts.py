@@ -265,6 +265,7 @@ def test_one_antenna_is_refused(toy):
         run_calibrator(SETTINGS, only)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     "settings", [SkyBased(gain_delay="200 ns"), SETTINGS.model_copy(update={"gain_delay": 200e-9})]
 )

@@ -91,6 +91,7 @@ def test_a_spectrum_of_noise_has_its_level_in_every_channel():
     assert np.std(noise, axis=(0, 1)) == pytest.approx(std, rel=0.02)
 
 
+@pytest.mark.chain
 def test_a_run_has_the_noise_of_its_beam_in_every_channel(tmp_path):
     settings = {"kind": "radiometer", "nights": 10_000}
     graph = Graph(validate(override(tiny(tmp_path), "corruption.noise", settings), tmp_path))
@@ -141,6 +142,7 @@ def test_autocorrelations_of_a_run_say_what_the_noise_of_its_baselines_is(tmp_pa
     assert np.std(product / product.mean()) < 1e-3
 
 
+@pytest.mark.chain
 def test_a_run_calibrates_with_weights_from_autocorrelations(tmp_path):
     graph = Graph(validate(override(tiny(tmp_path), "calibration.weights", "autos"), tmp_path))
     variant = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)

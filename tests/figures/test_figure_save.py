@@ -50,6 +50,7 @@ def test_saved_arrays_are_those_drawn_and_need_no_pickle(wedge_panels, tmp_path)
     assert imread(paths[2]).shape[:2] == (700, 1420)
 
 
+@pytest.mark.chain
 def test_same_figure_gives_the_same_bytes_at_another_time(wedge_panels, make_column, tmp_path, monkeypatch):
     for draw, data in ((draw_wedge, wedge_panels), (draw_spherical, [make_column(1)])):
         contents = []

@@ -84,6 +84,7 @@ def test_text_is_inside_the_page_and_large_enough_to_read(noted):
         assert min(text.get_fontsize() for text in texts) >= 5, name
 
 
+@pytest.mark.chain
 def test_stand_ins_are_printed_below_everything_and_only_when_there_are_any(plain, noted):
     for name, figure in noted.items():
         (note,) = [text for text in figure.findobj(Text) if "stand-in" in text.get_text()]
@@ -106,6 +107,7 @@ def test_settings_are_restored_after_an_error():
     assert dict(matplotlib.rcParams) == before
 
 
+@pytest.mark.chain
 def test_pictures_do_not_depend_on_the_users_settings(draw_all):
     some = ("layout", "wedge", "spherical one column", "gains", "runtime")
     expected = {name: pixels(figure) for name, figure in draw_all(only=some).items()}

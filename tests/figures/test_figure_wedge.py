@@ -99,6 +99,7 @@ def test_lines_are_at_the_light_travel_time_read_off_the_outer_axes(wedge_panels
         np.testing.assert_allclose(nanoseconds, metres / C * 1e9 + extra * 1e9, rtol=1e-9)
 
 
+@pytest.mark.chain
 def test_delay_axis_ends_where_asked_but_not_beyond_the_data(wedge_panels):
     for max_delay, expected in ((1e-6, 1000.0), (None, 59.5 / 30.72e6 * 1e9), (1.0, 59.5 / 30.72e6 * 1e9)):
         figure = draw_wedge(wedge_panels, max_delay=max_delay)

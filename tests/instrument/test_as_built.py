@@ -117,6 +117,7 @@ def tiles(beam_file):
     return dipole_amplitudes(settings.as_built.dipoles, 7), make_beams(settings, 7)
 
 
+@pytest.mark.chain
 def test_tiles_with_dead_dipoles_are_those_of_mwa_pb(tiles, monkeypatch):
     """The observatory's own code. Its azimuth is north through east, so its azimuth component has the other sign.
 

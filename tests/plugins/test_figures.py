@@ -170,6 +170,7 @@ def test_a_new_version_of_its_package_makes_an_installed_one_again(tmp_path, mon
     assert keys[0] != keys[1]
 
 
+@pytest.mark.chain
 def test_its_tolerance_is_used_by_regress(finished, tmp_path):
     reference = tmp_path / "reference"
     accept(finished.folder, reference)

@@ -107,6 +107,7 @@ def test_members_share_the_products_that_do_not_depend_on_what_differs(finished)
     assert len(one ^ two) == 2
 
 
+@pytest.mark.chain
 def test_the_report_and_the_results_lead_to_the_members(finished):
     run = RunFolder(finished.folder)
     assert [run.parts[name].path.resolve() for name in finished.parts] == [

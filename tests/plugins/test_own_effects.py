@@ -68,6 +68,7 @@ def test_its_settings_and_its_code_decide_the_product(plugged):
         assert found == "outside_crosstalk==1.2:outside-crosstalk"
 
 
+@pytest.mark.chain
 def test_effects_happen_to_the_data_in_their_order(plugged):
     """Crosstalk, then gains: V = g g* (sky + noise + crosstalk), and crosstalk is drawn once for both realizations."""
     experiment = with_effects(plugged, plugged.settings(amplitude="2 Jy"), {"kind": "per-channel-gains", "seed": 9})

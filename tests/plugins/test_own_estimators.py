@@ -51,6 +51,7 @@ def test_it_decides_the_spectra_and_nothing_before(plugged):
     assert spectra.power(other, "noise").key != own.key
 
 
+@pytest.mark.chain
 def test_its_spectra_of_noise_agree_with_the_defaults(plugged):
     """The noise's level to its error, and each mode to a few times the evolution of the beam over the band."""
     graphs = [Graph(with_estimator(plugged, each)) for each in ("hera-pspec", plugged.settings(lowest="0 Hz"))]

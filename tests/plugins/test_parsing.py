@@ -37,6 +37,7 @@ def busy():
     gc.set_threshold(*thresholds)
 
 
+@pytest.mark.chain
 def test_code_is_parsed_while_another_thread_parses(busy):
     ended = Event()
 

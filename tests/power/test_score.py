@@ -93,6 +93,7 @@ def test_against_a_perfect_calibration_the_error_is_that_of_the_score():
     assert found.bias_error == pytest.approx(alone.bias_error, rel=1e-9)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("apart", [0.03, 1.0])
 def test_paired_errors_are_the_scatter_of_draws_and_far_below_those_of_scores_that_differ_little(apart):
     draws = [of_draw(seed, apart) for seed in range(DRAWS)]

@@ -43,6 +43,7 @@ def test_every_solver_is_timed_as_often_as_asked():
     assert found.basis_bytes == 4 * found.vectors * 6 * 100
 
 
+@pytest.mark.chain
 def test_the_papers_step_and_ours_descend_alike():
     simulation = Simulation(Case(antennas=5, channels=96, extent=40.0))
     problem = simulation.problem(0, simulation.structure(), 0)
@@ -74,6 +75,7 @@ def test_a_descent_is_counted_from_its_losses():
     assert (descent.steps_to(0.05), descent.steps_to(0.01), descent.steps_to(0.001)) == (2, 4, None)
 
 
+@pytest.mark.chain
 def test_the_papers_descent_comes_close_to_the_minimum():
     found = descend(LINE, CHANNELS, BasisSettings(), 500)
     assert found.losses.size == 501

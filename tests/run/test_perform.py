@@ -303,6 +303,7 @@ def test_a_stage_that_exits_ends_the_run_with_a_traceback(tmp_path, make, worker
     assert f"in {make}" in result.stderr
 
 
+@pytest.mark.chain
 def test_workers_take_no_file_of_the_working_folder_for_a_module_of_python(tmp_path):
     (tmp_path / "signal.py").write_text("raise ImportError('not this one')")
     (tmp_path / "code").mkdir()
@@ -311,6 +312,7 @@ def test_workers_take_no_file_of_the_working_folder_for_a_module_of_python(tmp_p
     assert "not this one" not in result.stderr
 
 
+@pytest.mark.chain
 def test_workers_end_at_once_and_do_not_free_what_libraries_hold(tmp_path):
     result = program(tmp_path, "hold", workers=2)
     assert result.returncode == 0, result.stderr
@@ -352,6 +354,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.chain
 def test_what_a_dead_worker_had_made_is_not_made_again(tmp_path):
     """A worker is killed once while it makes the last product; the temporary data were dropped before."""
     (tmp_path / "program.py").write_text(DYING)
@@ -389,6 +392,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.chain
 def test_the_product_that_kills_its_worker_is_named(tmp_path):
     (tmp_path / "program.py").write_text(KILLING)
     command = [sys.executable, "program.py"]

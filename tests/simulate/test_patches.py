@@ -76,6 +76,7 @@ def test_a_smooth_sky_is_exact_to_its_tolerance(wide, sources, embedded_beam):
     assert relative_error(cube, direct) < 1e-8
 
 
+@pytest.mark.chain
 def test_several_beams_have_patches_too(embedded_beam, dipole_beam):
     template = observe(count=12, channels=3, width="640 kHz", times=14, integration="8 s")
     beams = AntennaBeams((embedded_beam, dipole_beam), np.arange(12) % 2)

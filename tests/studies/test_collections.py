@@ -112,6 +112,7 @@ def test_the_combined_figure_shows_the_tables_of_the_members(finished):
         assert (len(shown["0.numbers"]), len(shown["1.numbers"])) == (7, 7)
 
 
+@pytest.mark.chain
 def test_combined_claims_hold_each_member_to_its_role(finished):
     claims = {claim.name: claim for claim in from_json((finished.folder / "claims.json").read_text())}
     assert claims["noise-reduced"].runs == ("hexagon", "redundant")

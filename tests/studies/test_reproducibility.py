@@ -69,6 +69,7 @@ def test_worker_processes_change_nothing(reference, tmp_path):
     assert_equal(arrays(reference), arrays(other))
 
 
+@pytest.mark.chain
 def test_calibration_chunks_change_nothing_without_warm_starts(tmp_path):
     """With warm starts a chunk's first integration starts from unity: the number of chunks is part of the key."""
     cold = {"calibration.solver": {"name": "gauss-newton", "warm_start": False}}

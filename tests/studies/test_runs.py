@@ -82,6 +82,7 @@ def test_a_run_leaves_figures_tables_manifest_and_a_file_that_reads_back(finishe
     assert json.loads((finished.folder / "claims.json").read_text())
 
 
+@pytest.mark.chain
 def test_products_are_in_standard_formats(finished):
     label = "corrupted data (foregrounds + eor + noise even)"
     assert UVData.from_file(product_of(finished, "simulate", "foregrounds") / "visibilities.uvh5").Nbls == 21

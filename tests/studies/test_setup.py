@@ -29,7 +29,7 @@ def test_a_change_is_in_the_line(change, words):
 
 
 def test_a_comparison_has_the_data_of_all_worlds_only_if_they_are_the_same():
-    assert "antennas" in load_study(Path("prior")).setup.split(";")[0]
+    assert "antennas" in load_study(Path("unbiased")).setup.split(";")[0]
     assert load_study(Path("calibrators")).setup == ""
 
 
