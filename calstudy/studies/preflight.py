@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -77,8 +78,8 @@ def _require_small_errors(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    found = (_needless_limit(experiment), _average(experiment), _needless_chunks(experiment), _distant_box(experiment))
-    return tuple(note for note in found if note)
+    found = (_needless_limit, _average, _needless_chunks, _needless_pieces, _distant_box)
+    return tuple(note for note in (note(experiment) for note in found) if note)
 
 
 def _needless_limit(experiment: Experiment) -> str:
@@ -112,6 +113,14 @@ def _needless_chunks(experiment: Experiment) -> str:
     if chunks <= max(channels, SimulationSettings().chunks):
         return ""
     return f"simulation.chunks = {chunks}: the EoR is simulated in {channels} parts, for there are no more channels"
+
+
+def _needless_pieces(experiment: Experiment) -> str:
+    settings, times = experiment.calibration, experiment.instrument.times.count
+    solves = math.ceil(times / settings.integrations_per_solve)
+    if settings.chunks <= max(solves, type(settings).model_fields["chunks"].default):
+        return ""
+    return f"calibration.chunks = {settings.chunks}: there are {solves} pieces, one for each solve"
 
 
 def _average(experiment: Experiment) -> str:

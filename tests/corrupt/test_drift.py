@@ -239,17 +239,26 @@ def test_a_reflection_swings_in_delay_and_size_in_the_named_cables(observed):
     np.testing.assert_allclose(-turned / slope / 2e-9, change / 0.2, atol=1e-6)
 
 
+def test_named_antennas_alone_reflect_and_as_without_names(observed):
+    block = {"kind": "reflection-gains", "amplitude": 0.05, "delay": "300 ns", "delay_scatter": "20 ns", "seed": 4}
+    every = draw_truth(Effect.registry.make(block), observed)["gains"]
+    some = draw_truth(Effect.registry.make({**block, "antennas": [2, 5]}), observed)["gains"]
+    assert np.array_equal(some[[2, 5]], every[[2, 5]])
+    assert np.all(np.delete(some, [2, 5], axis=0) == 1)
+
+
 @pytest.mark.parametrize(
     ("block", "field"),
     [
-        ({"kind": "bandpass", "drift": {"kind": "jumps", "antennas": [99]}}, "drift"),
-        ({"kind": "coarse-channels", "drift": {"kind": "jumps", "antennas": [99]}}, "drift"),
-        ({"kind": "reflection-gains", "swing": {"delay": "1 ns", "antennas": [99]}}, "swing"),
+        ({"kind": "bandpass", "drift": {"kind": "jumps", "antennas": [99]}}, "drift.antennas"),
+        ({"kind": "coarse-channels", "drift": {"kind": "jumps", "antennas": [99]}}, "drift.antennas"),
+        ({"kind": "reflection-gains", "swing": {"delay": "1 ns", "antennas": [99]}}, "swing.antennas"),
+        ({"kind": "reflection-gains", "antennas": [99]}, "antennas"),
     ],
 )
 def test_changes_of_antennas_that_do_not_exist_are_refused(block, field):
     size = size_of_instrument(small_instrument(channels={"count": 64, "width": "40 kHz"}))
-    with pytest.raises(InputError, match=rf"^corruption.effects.0.{field}.antennas: names antenna 99"):
+    with pytest.raises(InputError, match=rf"^corruption.effects.0.{field}: names antenna 99"):
         require_usable([Effect.registry.make(block)], size)
 
 

@@ -283,6 +283,7 @@ def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tm
     [
         ("power.coherent_time=1 s", "is shorter than an integration of"),
         ("simulation.chunks=50", "simulation.chunks = 50: the EoR is simulated in"),
+        ("calibration.chunks=50", "calibration.chunks = 50: there are"),
     ],
 )
 def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path, capsys, monkeypatch):

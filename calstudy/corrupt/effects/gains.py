@@ -131,6 +131,9 @@ class ReflectionGains(GainEffect):
     amplitude: float = Field(0.01, ge=0, lt=1, description="Mean of the exponential distribution of r.")
     delay: Delay = Field(1200e-9, description="Mean of the normal distribution of the delay.")
     delay_scatter: Delay = Field(100e-9, ge=0, description="Standard deviation of that distribution.")
+    antennas: Antennas = Field(
+        (), description="Antennas with a reflection, counted from 0 in the order of the layout; empty: all."
+    )
     swing: Swing | None = Field(None, description="How delay and r change during the run; null: they are constant.")
     seed: int = Field(5, ge=0, description="Seed of r, tau and phi.")
 
@@ -142,8 +145,11 @@ class ReflectionGains(GainEffect):
                 f"delay: {self.delay:g} s must be at most {longest:.3g} s, one over the width of a channel, in which "
                 "later reflections average out"
             )
-        reason = None if self.swing is None else refusal_of_antennas(self.swing.antennas, size.antennas)
-        return super().refusal(size) if reason is None else f"swing.antennas: {reason}"
+        named = {"antennas": self.antennas, "swing.antennas": () if self.swing is None else self.swing.antennas}
+        for field, antennas in named.items():
+            if (reason := refusal_of_antennas(antennas, size.antennas)) is not None:
+                return f"{field}: {reason}"
+        return super().refusal(size)
 
     @property
     def varies(self) -> bool:
@@ -157,6 +163,8 @@ class ReflectionGains(GainEffect):
         """
         shape = (observation.n_polarizations, observation.n_antennas, 1, 1)
         amplitudes = random.exponential(self.amplitude, shape)
+        if self.antennas:
+            amplitudes = amplitudes * is_named(self.antennas, observation)[..., 0]
         delays = random.normal(self.delay, self.delay_scatter, shape)
         phases = random.uniform(0, 2 * np.pi, shape)
         if self.swing is not None:
