@@ -44,6 +44,7 @@ OTHER: dict[str, list[Any]] = {
     "DeadAntennas.antennas": [[1]],
     "Bandpass.time": ["1 min"],
     "_Drift.antennas": [[1]],
+    "ReflectionGains.antennas": [[1]],
     "Swing.antennas": [[1]],
     "RadiometerNoise.seeds": [[55, 56]],
     "NoiseRelativeToEor.seeds": [[55, 56]],
