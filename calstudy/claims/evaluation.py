@@ -176,7 +176,7 @@ def refusal_of_role(papers: Sequence[Paper], role: str, experiment: Experiment) 
     return None if None in found else next(iter(found), None)
 
 
-INSTEAD = "name a paper by --paper, or use --run-code if you trust who wrote the folder"
+INSTEAD = "use --run-code if you trust who wrote the folder, or, if it is a paper, name one by --paper"
 
 
 def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> Evaluation:

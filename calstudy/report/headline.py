@@ -14,14 +14,12 @@ from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
 from calstudy.verdicts.criterion import Verdict
-from calstudy.verdicts.standing import marked, why_not_measured
+from calstudy.verdicts.standing import SIGMAS, marked, why_not_measured
 from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
 MEASURED_BAND = (0.3, 0.5)
 """The same for measured data, whose T is in other bands."""
 PLACE = f"outside the wedge, k of {HEADLINE_BAND[0]:g} to {HEADLINE_BAND[1]:g} h/Mpc"
-SIGNIFICANT = 5.0
-"""Standard deviations below which a bias may be noise."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Signal:
     @property
     def excess(self) -> str | None:
         """A warning if the bias exceeds the EoR by more than the noise explains; else None."""
-        if abs(self.bias) < 1 or abs(self.bias) < SIGNIFICANT * self.bias_error:
+        if not abs(self.bias) - SIGMAS * self.bias_error > 1:
             return None
         return (
             f"{PLACE}, the residual without EoR has {two_digits(abs(self.bias))} times the power of the EoR: "
@@ -119,7 +117,7 @@ def measured_numbers(run: RunFolder) -> list[Number]:
             text = f"not measured ({why})" if why else number(band["transfer"], band["error"])
             low, high = MEASURED_BAND
             left = f"part of an injected EoR's power that is left, outside the wedge, k of {low:g} to {high:g} h/Mpc"
-            numbers.append(Number("T", text, left))
+            numbers.append(Number(f"T at k of {low:g} to {high:g} h/Mpc", text, left))
     return numbers
 
 

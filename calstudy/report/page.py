@@ -377,7 +377,7 @@ def write_page(page: str, path: Path) -> Path:
 ALWAYS_DIFFERENT = ("name", "description", "outputs")
 """Sections of an experiment whose differences do not concern its results."""
 COLOURS = ("orange", "cyan", "magenta", "red", "black", "grey")
-"""Colours of the runs in charts of all; the EoR, of the first run, is grey."""
+"""Colours of the runs in charts of all; the EoR is grey."""
 MOST = len(COLOURS) - 1
 
 
@@ -441,8 +441,12 @@ def _differences(texts: Sequence[str], names: Sequence[str]) -> Table:
 
 
 def _overlaid(runs: Sequence[RunFolder], names: Sequence[str]) -> list[Chart]:
-    """Return P^R of all runs with the EoR of the first, and T of all, outside the wedge; none where one run has it."""
+    """Return P^R of all runs with their EoR, once where it is the same, and T of all, outside the wedge.
+
+    There are none where one run has it.
+    """
     spectra: list[dict[str, Any]] = []
+    signals: list[np.ndarray] = []
     transfers: list[dict[str, Any]] = []
     for run, name, colour in zip(runs, names, COLOURS, strict=False):
         for variant in ("residual", "eor"):
@@ -452,7 +456,8 @@ def _overlaid(runs: Sequence[RunFolder], names: Sequence[str]) -> list[Chart]:
                 points = (found.k, found.power.real, found.error)
                 if variant == "residual":
                     spectra.append(curve(f"{label}, {name}", colour, points))
-                elif all(other["colour"] != grey for other in spectra):
+                elif not any(np.array_equal(found.power.real, other) for other in signals):
+                    signals.append(found.power.real)
                     spectra.append(curve(f"{label}, {name}", grey, points))
         with suppress(Unevaluated, InputError):
             loss = run.tables.transfer("outside-wedge")

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from calstudy.base.table import Table, two_digits
@@ -83,6 +83,8 @@ class InWorld:
     bias: float = math.nan
     bias_error: float = math.nan
     refused: bool = False
+    solves: Mapping[str, int] = field(default_factory=dict)
+    """Number of solves by status."""
 
     def standing(self, limit: float) -> Standing:
         """Return whether the bias is below the limit."""
@@ -163,7 +165,15 @@ class InBand:
     def numbers(self) -> str:
         """The upper limit of the bias in all worlds, and the smallest T."""
         limit = self.upper_limit
-        return f"{'bias or its error not known' if math.isnan(limit) else f'bias < {two_digits(limit)}'}, {self.kept}"
+        bias = "bias or its error not known" if math.isnan(limit) else f"bias < {two_digits(limit)}"
+        return f"{bias}, {self.kept}{self._not_converged}"
+
+    @property
+    def _not_converged(self) -> str:
+        """How many solves of all worlds did not converge; nothing if all did."""
+        count = sum(sum(world.solves.values()) for world in self.worlds)
+        rest = count - sum(world.solves.get("converged", 0) for world in self.worlds)
+        return f", {rest} of {count} solves not converged" if rest else ""
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -208,16 +218,19 @@ def standings(
             for world, cases in scores.items():
                 if name in cases:
                     bands_there = cases[name]["bands"]
-                    rows += [_in_world(world, entry) for entry in bands_there if tuple(entry["k"]) == (low, high)]
+                    solves = cases[name].get("by_status", {})
+                    rows += [
+                        _in_world(world, entry, solves) for entry in bands_there if tuple(entry["k"]) == (low, high)
+                    ]
                 elif (world, name) in refused:
                     rows.append(InWorld(world, refused=True))
     return [InBand(name, band, worlds, limit) for (band, name), worlds in found.items() if worlds]
 
 
-def _in_world(world: str, band: Mapping[str, Any]) -> InWorld:
+def _in_world(world: str, band: Mapping[str, Any], solves: Mapping[str, int]) -> InWorld:
     names = ("transfer", "transfer_error", "bias", "bias_error")
     transfer, transfer_error, bias, bias_error = (math.nan if band[name] is None else band[name] for name in names)
-    return InWorld(world, transfer, transfer_error, bias, bias_error)
+    return InWorld(world, transfer, transfer_error, bias, bias_error, solves=solves)
 
 
 def advice(found: Sequence[InBand]) -> list[str]:

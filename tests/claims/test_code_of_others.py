@@ -25,7 +25,7 @@ def test_claims_of_a_folder_run_no_code_that_it_names(field, tmp_path, capsys):
     (folder / "manifest.json").write_text(json.dumps({"name": "theirs", "stand_ins": []}))
     status, message = run_command(capsys, "claims", folder)
     assert status == 2
-    assert "evil.py' is code, which is not run here; name a paper by --paper, or use --run-code" in message
+    assert "evil.py' is code, which is not run here; use --run-code if you trust who wrote" in message
     assert not code.with_suffix(".ran").exists()
     if field == "papers":
         # Papers of the folder are not looked at if others are named.

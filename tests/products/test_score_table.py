@@ -32,7 +32,7 @@ def test_a_table_has_no_processor_time_of_scores_that_do_not_tell():
         (scores_of(0.70, 0.011, cross_transfer=0.82, linear_transfer=0.70), "0.700 ± 0.011 (C 0.82)"),
         (scores_of(0.70, 0.011, cross_transfer=0.82, linear_transfer=0.66), "0.700 ± 0.011 (C 0.82, linear 0.66)"),
         (scores_of(0.70, 0.011, cross_transfer=None), "0.700 ± 0.011"),
-        (scores_of(0.70, 0.40, cross_transfer=0.0), "not measured (0.70 ± 0.4)"),
+        (scores_of(0.70, 0.40, cross_transfer=0.0), "not measured (0.70 ± 0.40)"),
         (scores_of(None, None, cross_transfer=None), "-"),
     ],
 )

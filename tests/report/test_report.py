@@ -121,7 +121,7 @@ def test_claims_are_a_table_if_there_are_any(folder):
     (folder / "claims.json").write_text(json.dumps([CLAIM, unknown, failed]))
     found = rows(folder, "Claims of the paper")
     assert [row[-1] for row in found] == ["supported", "contradicted"]
-    assert found[0][3] == "1.23 ± 0.1"
+    assert found[0][3] == "1.23 ± 0.10"
     page = page_of(folder)
     assert ("td", "class", "contradicted") in page.attributes
     assert "1 further claims were not evaluated" in page.words

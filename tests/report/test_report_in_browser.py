@@ -67,11 +67,11 @@ def test_the_report_works_at_any_width(folder, width):
     assert found["errors"] == []
     # A headless window may not be made as narrow as it is asked to be; the page has to fit whatever it is.
     assert found["wide"] <= 0
-    assert found["rising"] == ["-3.00 ± 0.1", "1.50 ± 0.1", "12.00 ± 0.1"]
+    assert found["rising"] == ["-3.00 ± 0.10", "1.50 ± 0.10", "12.00 ± 0.10"]
     assert found["falling"] == found["rising"][::-1]
     assert found["failed"] == ["contradicted"]
     assert found["count"] == "1 of 3"
-    assert found["words"] == ["1.50 ± 0.1"]
+    assert found["words"] == ["1.50 ± 0.10"]
     # Once on top, and once below the figure.
     assert found["points"] == 6
     assert "k = 0.3" in found["curve"]

@@ -15,14 +15,14 @@ from calstudy.report.page import MOST, read_several, write_several
 K, EDGES = np.array([0.15, 0.35, 0.7]), np.array([0.1, 0.2, 0.5, 0.9])
 
 
-def run_folder(folder, power, seed=1, name="demo", transfer=None):
+def run_folder(folder, power, seed=1, name="demo", transfer=None, eor=5.0):
     """A finished run with power spectra of EoR and residual, and T if it is given."""
     tables = folder / "tables"
     tables.mkdir(parents=True)
     (folder / "manifest.json").write_text(json.dumps({"name": name}))
     (folder / "experiment.yaml").write_text(f"name: {name}\nsky: {{seed: {seed}}}\n")
     one, count = np.ones(3), np.ones(3, int)
-    for variant, value in (("eor", 5 * one), ("residual", power)):
+    for variant, value in (("eor", eor * one), ("residual", power)):
         spectrum = SphericalSpectrum(K, EDGES, value + 0j, count, count, count, count, 0.1 * one, 0.1 * one, True)
         save_spectrum(tables / spectrum_file(variant, "outside-wedge"), spectrum)
     if transfer is not None:
@@ -50,6 +50,14 @@ def test_spectra_and_transfer_of_all_runs_are_in_one_chart(tmp_path):
     assert [one["label"] for one in transfer.data["series"]] == ["a", "c"]
     # A run has the same colour in both charts.
     assert transfer.data["series"][1]["colour"] == found["residual, P^R, c"]["colour"]
+
+
+def test_every_eor_is_drawn_that_differs(tmp_path):
+    levels = {"a": 5.0, "b": 5.0, "c": 0.1}
+    folders = [run_folder(tmp_path / name, K, name=name, eor=eor) for name, eor in levels.items()]
+    (spectra,) = read_several(folders).charts
+    found = {one["label"]: one["y"] for one in spectra.data["series"] if one["label"].startswith("EoR")}
+    assert {name: values[0] for name, values in found.items()} == {"EoR, P^S, a": 5.0, "EoR, P^S, c": 0.1}
 
 
 def test_fields_that_differ_in_any_run_are_listed_and_runs_of_one_name_have_those_of_their_folders(tmp_path):

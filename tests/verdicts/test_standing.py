@@ -39,6 +39,12 @@ def test_a_bias_is_below_the_limit_above_it_or_cannot_be_told(bias, error, expec
     assert standing_of(case(bias, error)).standing == expected
 
 
+def test_solves_that_did_not_converge_are_said_beside_the_numbers():
+    cases = [{**case(0.0, 0.01), "by_status": {"converged": 2, **more}} for more in ({}, {"stalled": 1, "failed": 1})]
+    assert str(standing_of(*cases)).endswith("T ≥ 0.80, 2 of 6 solves not converged")
+    assert str(standing_of(cases[0])).endswith("T ≥ 0.80")
+
+
 def test_the_worst_world_decides_and_is_named():
     good, bad = case(0.0, 0.01), case(44.0, 9.0)
     assert standing_of(good, good).standing == "passes"

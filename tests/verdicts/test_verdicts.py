@@ -248,7 +248,7 @@ def test_verdicts_with_several_solvers_are_side_by_side(tmp_path):
     assert "Stand-in: a small sky." in lines
     headings, _, row, other = (line.replace("\\|", "").split(" | ") for line in lines if line.startswith("| "))
     assert headings[2:] == ["measured is", "must be", "paper's", "", "ours", " |"]
-    assert row[3:] == ["from 0.5 to 2", "**0.25 ± 0.1**", "contradicted", "**1.00 ± 0.1**", "supported |"]
+    assert row[3:] == ["from 0.5 to 2", "**0.25 ± 0.10**", "contradicted", "**1.00 ± 0.10**", "supported |"]
     assert other[4:6] == ["-", "not evaluated"]
 
 
