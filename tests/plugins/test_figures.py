@@ -187,6 +187,7 @@ def test_its_tolerance_is_used_by_regress(finished, tmp_path):
         assert compared[NAME, "ratio"].tolerance.startswith("largest 4 σ")
 
 
+@pytest.mark.chain
 def test_a_reference_whose_figure_is_gone_can_be_read(finished, tmp_path):
     accept(finished.folder, tmp_path)
     text = (tmp_path / "experiment.yaml").read_text()

@@ -27,6 +27,8 @@ from calstudy.run.store import Store
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import Budget, Run, run_study
 
+pytestmark = pytest.mark.chain
+
 
 def run_here(data: dict, folder: Path) -> tuple[Run, str]:
     text = io.StringIO()
@@ -65,7 +67,6 @@ def stages_made(result: Run) -> set[str]:
     return {task.stage.name for task in result.made.tasks}
 
 
-@pytest.mark.chain
 def test_a_run_leaves_figures_tables_manifest_and_a_file_that_reads_back(finished):
     names = {path.name for path in (finished.folder / "figures").iterdir()}
     figures, endings = load_tiny(finished).outputs.figures, ("png", "pdf", "npz")
@@ -82,7 +83,6 @@ def test_a_run_leaves_figures_tables_manifest_and_a_file_that_reads_back(finishe
     assert json.loads((finished.folder / "claims.json").read_text())
 
 
-@pytest.mark.chain
 def test_products_are_in_standard_formats(finished):
     label = "corrupted data (foregrounds + eor + noise even)"
     assert UVData.from_file(product_of(finished, "simulate", "foregrounds") / "visibilities.uvh5").Nbls == 21
@@ -192,7 +192,6 @@ def command(path: Path, *options: str) -> list[str]:
     return [sys.executable, "-m", "calstudy", "run", str(path), *options]
 
 
-@pytest.mark.chain
 def test_a_killed_run_resumes_and_ends_as_if_it_had_not_been(finished, tmp_path):
     path = tmp_path / "tiny.yaml"
     path.write_text(yaml.safe_dump(of_the_paper(tmp_path)))
