@@ -187,9 +187,12 @@ def _show_signal(folder: Path, console: Console) -> None:
 
 
 def _show_answer(folder: Path, console: Console) -> None:
-    """Print which calibrators of a comparison pass; nothing for other runs."""
-    found = RunFolder(folder).standings()
+    """Print which calibrators of a comparison pass, or T of every point of a sweep; nothing for other runs."""
+    run = RunFolder(folder)
+    found = run.standings()
     if not found:
+        for table in run.shown if run.parts else ():
+            table.show(console, numbers=False)
         return
     table = standing_table(found)
     table.show(console, numbers=False)

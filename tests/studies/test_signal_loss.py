@@ -1,6 +1,7 @@
 """Signal loss in the chain: what the gains must absorb, they do, and sweeps compare it."""
 
 import csv
+import io
 import json
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from observations import small_instrument
+from rich.console import Console
 from small_chain import ANTENNAS, VARIANTS, small
 from tiny import load
 
@@ -23,6 +25,7 @@ from calstudy.products.signal_loss import SCALE, FluxScale, transfer
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.kinds.sweep import Sweep, expand
 from calstudy.studies.load import load_study
+from calstudy.studies.show import show_run
 from calstudy.studies.study import Budget, Run, run_study
 
 pytestmark = pytest.mark.chain
@@ -177,6 +180,14 @@ def test_the_figure_pools_skies_and_keeps_the_rest_apart(swept):
     between = sorted(item.transfer[3] for item in single)
     assert between[0] <= pooled[3] <= between[1]
     assert error[3] < min(item.transfer_error[3] for item in single)
+
+
+def test_the_end_of_a_sweep_has_t_of_every_point(swept):
+    text = io.StringIO()
+    show_run(swept, Console(file=text, width=200))
+    (line,) = [line for line in text.getvalue().splitlines() if "│ 03-buffer=400ns-seed=2" in line]
+    found = table(swept, 3, "transfer-bands.outside-wedge")
+    assert f" {found.scale_free_transfer[3]:.3f} ± {found.scale_free_transfer_error[3]:.3f} " in line
 
 
 def test_a_second_sweep_makes_nothing(swept, folder):
