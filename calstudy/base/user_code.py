@@ -91,7 +91,7 @@ def beside_of(path: Path) -> dict[str, Path]:
 def identity_of_file(path: Path, part: str = "") -> str:
     """Return the identity of a file by its content, and of a Python file by the modules of `beside_of` as well.
 
-    With `part`, of what has this name in it.
+    `part`, such as ``:MeanGain``, says which of its classes is used.
     """
     beside = beside_of(path) if path.suffix == ".py" else {}
     others = "".join(f":{name}={digest_file(found)}" for name, found in sorted(beside.items()))

@@ -262,6 +262,13 @@ def test_changes_of_antennas_that_do_not_exist_are_refused(block, field):
         require_usable([Effect.registry.make(block)], size)
 
 
+def test_a_swing_of_an_antenna_without_a_reflection_is_refused():
+    block = {"kind": "reflection-gains", "antennas": [1, 2], "swing": {"delay": "1 ns", "antennas": [2, 3]}}
+    size = size_of_instrument(small_instrument(channels={"count": 64, "width": "40 kHz"}))
+    with pytest.raises(InputError, match=r"^corruption.effects.0.swing.antennas: names antenna 3, which has no refl"):
+        require_usable([Effect.registry.make(block)], size)
+
+
 def test_two_drifts_with_the_same_seeds_are_refused():
     drifting = {"kind": "file-gains", "path": "x.calh5", "drift": "jumps"}
     with pytest.raises(ValidationError, match="as that of item 0: what they draw would not be independent"):

@@ -145,10 +145,12 @@ class ReflectionGains(GainEffect):
                 f"delay: {self.delay:g} s must be at most {longest:.3g} s, one over the width of a channel, in which "
                 "later reflections average out"
             )
-        named = {"antennas": self.antennas, "swing.antennas": () if self.swing is None else self.swing.antennas}
-        for field, antennas in named.items():
+        swinging = () if self.swing is None else self.swing.antennas
+        for field, antennas in (("antennas", self.antennas), ("swing.antennas", swinging)):
             if (reason := refusal_of_antennas(antennas, size.antennas)) is not None:
                 return f"{field}: {reason}"
+        if self.antennas and (still := sorted(set(swinging) - set(self.antennas))):
+            return f"swing.antennas: names antenna {still[0]}, which has no reflection; add it to antennas"
         return super().refusal(size)
 
     @property
