@@ -122,8 +122,12 @@ class GainWeights(Section):
 
 def unsettled_message(change: float, passes: int) -> str:
     """Return the message for a fit whose weights from its gains have not converged."""
-    sentence = f"weights from the gains still changed by {change:.1e} in pass {passes}"
-    return f"{sentence}, so that the result is that of equal weights" if change > RUNAWAY else sentence
+    if change > RUNAWAY:
+        return (
+            f"weights from the gains did not settle in {passes} passes: the result is that of equal weights "
+            "('calibration.weights: autos' needs no passes)"
+        )
+    return f"weights from the gains still changed by {100 * change:.2g} % in pass {passes}"
 
 
 class FlagWeights(Section):

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -39,6 +40,7 @@ SERIES = {
     "inside": ("inside the wedge", "cyan"),
 }
 POWER = "P [mK² h⁻³ Mpc³]"
+NUMBER = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ def read_contents(run: RunFolder) -> Contents:
         warnings=[
             *excess,
             *manifest.get("warnings", []),
-            *(f"{label}: {text}" for label, text in _warnings(run.products)),
+            *recorded_warnings(run.products),
         ],
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
@@ -223,12 +225,16 @@ def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
     return {name: str(value) for name, value in facts.items() if value}
 
 
-def _warnings(products: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    return [
-        (f"{item['stage']} ({item['label']})", text)
-        for item in products
-        for text in item.get("notes", {}).get("warnings", [])
-    ]
+def recorded_warnings(records: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the warnings in the records of products; of those that differ in numbers alone, the first and a count."""
+    alike: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for record in records:
+        for text in record.get("notes", {}).get("warnings", []):
+            alike.setdefault((record["stage"], NUMBER.sub("", text)), []).append((record["label"], text))
+    sentences = []
+    for (stage, _), ((label, text), *others) in alike.items():
+        sentences.append(f"{stage} ({label}{f', and {len(others)} more' if others else ''}): {text}")
+    return sentences
 
 
 def _pictures(run: RunFolder) -> list[Picture]:

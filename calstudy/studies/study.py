@@ -22,7 +22,7 @@ from calstudy.base.schema import Section
 from calstudy.base.table import to_json
 from calstudy.experiment.files import StudyFile, dump
 from calstudy.experiment.model import Experiment, Folders
-from calstudy.report.page import write_report
+from calstudy.report.page import recorded_warnings, write_report
 from calstudy.results.reader import SHOWN
 from calstudy.run.execution import Budget, Lifetimes, Schedule, Workers, execute, found_of, schedule, without_record
 from calstudy.run.progress import report
@@ -85,12 +85,8 @@ class Run:
     @property
     def warnings(self) -> list[str]:
         """Warnings of the stages, with the product concerned."""
-        records = [product.record for product in self.made.products.values()]
-        return removed(self.tasks, self.made.products) + [
-            f"{record['stage']} ({record['label']}): {text}"
-            for record in records
-            for text in record["notes"].get("warnings", [])
-        ]
+        records = (product.record for product in self.made.products.values())
+        return removed(self.tasks, self.made.products) + recorded_warnings(records)
 
 
 def removed(tasks: Iterable[Task], products: Container[str]) -> list[str]:

@@ -18,7 +18,7 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.products.signal_loss import SweepSummary, Transfer
-from calstudy.report.page import read_contents, write_report
+from calstudy.report.page import read_contents, recorded_warnings, write_report
 from calstudy.results.reader import RunFolder
 
 
@@ -112,6 +112,21 @@ def test_convergence_simulation_and_stages_are_told(folder):
     ]
     assert rows(folder, "Stages")[-1] == ("figure", "2", "2", "60 s", "2 min", "2.50 GB")
     assert read_contents(RunFolder(folder)).warnings == ["calibrate (V even): 1 of 8 solves did not converge"]
+
+
+def test_warnings_that_differ_in_numbers_alone_are_given_once():
+    said = [
+        ("calibrate", "V even", "6 of 6 solves stalled, at 2.5e-01"),
+        ("calibrate", "V odd", "5 of 6 solves stalled, at 1"),
+        ("calibrate", "V odd", "noise dominates"),
+        ("power", "V", "6 of 6 solves stalled, at 2.5e-01"),
+    ]
+    records = [{"stage": stage, "label": label, "notes": {"warnings": [text]}} for stage, label, text in said]
+    assert recorded_warnings(records) == [
+        "calibrate (V even, and 1 more): 6 of 6 solves stalled, at 2.5e-01",
+        "calibrate (V odd): noise dominates",
+        "power (V): 6 of 6 solves stalled, at 2.5e-01",
+    ]
 
 
 def test_claims_are_a_table_if_there_are_any(folder):
