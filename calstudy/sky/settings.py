@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -163,9 +164,12 @@ class CodeSources(Section):
     def _function_is_there(self, info: ValidationInfo) -> CodeSources:
         if folder_of_files(info) is not None:
             try:
-                load_function(self.path, self.function)
+                inspect.signature(load_function(self.path, self.function)).bind(None, **self.options)
             except InputError as error:
                 raise fault("", str(error)) from None
+            except TypeError as error:
+                called = ", ".join(["frequencies", *(f"{name}=..." for name in self.options)])
+                raise fault("function", f"is called as {self.function}({called}): {error}") from None
         return self
 
 

@@ -21,6 +21,8 @@ from calstudy.base.user_code import load_file
 from calstudy.experiment.model import Experiment
 from calstudy.studies.study import KINDS, Study, built_in_kinds
 
+PLAIN: dict[Any, str] = {int: "whole number", float: "number", str: "text", Path: "path"}
+
 
 def _blocks(annotation: Any) -> list[type[BaseModel]]:
     return [item for item in alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
@@ -47,15 +49,15 @@ def _kind(info: FieldInfo) -> str:
     for item in alternatives(info.annotation):
         if get_origin(item) is Literal:
             words.append(" \\| ".join(f"`{value}`" for value in get_args(item)))
-        elif get_origin(item) is tuple:
-            choices = " \\| ".join(f"`{value}`" for value in get_args(get_args(item)[0]) if isinstance(value, str))
-            words.append(f"list of {choices}" if choices else "list")
+        elif get_origin(item) in (tuple, list):
+            entry = get_args(item)[0]
+            choices = " \\| ".join(f"`{value}`" for value in get_args(entry) if isinstance(value, str))
+            entries = choices or (f"{PLAIN[entry]}s" if entry in PLAIN else "")
+            words.append(f"list of {entries}" if entries else "list")
         elif get_origin(item) is dict or _blocks(item):
             words.append("block")
         else:
-            words.append(
-                {int: "whole number", float: "number", bool: "true or false", str: "text", Path: "path"}.get(item, "")
-            )
+            words.append("true or false" if item is bool else PLAIN.get(item, ""))
     return ", or ".join(dict.fromkeys(word for word in words if word))
 
 

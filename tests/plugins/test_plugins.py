@@ -31,6 +31,7 @@ from calstudy.simulate.interface import Engine
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import CodeSources
 from calstudy.studies.load import load_study
+from calstudy.studies.reference import plugin_reference
 from calstudy.studies.study import run_study
 
 OWN_CODE = Path(__file__).parents[2] / "notebooks" / "own_code.py"
@@ -73,15 +74,37 @@ def test_a_sky_of_ones_own(tmp_path):
         make_foregrounds(CodeSources(kind="code", path=other, function="sky"), frequencies)
 
 
-def test_a_sky_that_cannot_be_made_is_told_before_anything_starts(tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "refusal"),
+    [
+        ({"function": "absent"}, "sky.foregrounds: 'absent' is not a function of sky.py (it has: sky)"),
+        (
+            {"options": {"n": 3}},
+            "sky.foregrounds.function: is called as sky(frequencies, n=...): got an unexpected keyword argument 'n'",
+        ),
+    ],
+)
+def test_a_sky_that_cannot_be_made_is_refused_before_anything_starts(tmp_path, changes, refusal):
     content = tiny(tmp_path)
-    content["sky"] = {**content["sky"], "foregrounds": {"kind": "code", "path": "sky.py", "function": "absent"}}
+    foregrounds = {"kind": "code", "path": "sky.py", "function": "sky", **changes}
+    content["sky"] = {**content["sky"], "foregrounds": foregrounds}
     (tmp_path / "sky.py").write_text("def sky(frequencies):\n    return frequencies\n")
     path = tmp_path / "own.yaml"
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(ExperimentError) as caught:
         load(path)
-    assert caught.value.faults == ["sky.foregrounds: 'absent' is not a function of sky.py (it has: sky)"]
+    assert caught.value.faults == [refusal]
+
+
+def test_fields_of_lists_say_what_is_in_them(tmp_path):
+    path = tmp_path / "listed.py"
+    path.write_text(
+        "from calstudy.corrupt.interface import Effect\n\n\nclass Listed(Effect):\n"
+        "    antennas: list[int]\n    limits: tuple[float, ...] | None = None\n"
+    )
+    text = plugin_reference(path)
+    assert "| `antennas` | list of whole numbers | required |" in text
+    assert "| `limits` | list of numbers | null |" in text
 
 
 def test_the_notebooks_calibrator_finds_the_gains(template):
