@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -35,6 +36,12 @@ def load_tensorflow() -> None:
         return
     with _without_keras(), errors_written_to(Path(os.devnull)):
         importlib.import_module("tensorflow")
+    logging.getLogger("tensorflow").addFilter(_is_no_count_of_tracings)
+
+
+def _is_no_count_of_tracings(record: logging.LogRecord) -> bool:
+    """Leave out a warning: every structure of a fit is traced once, and TensorFlow counts these together."""
+    return "triggered tf.function retracing" not in record.getMessage()
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from calstudy.studies.reference import plugin_reference
 from calstudy.studies.study import run_study
 
 # These change what is calibrated, and share nothing of it with other examples: one variant goes all the way.
-ALONE = ("A layout", "A beam", "An engine", "An effect", "A calibrator")
+ALONE = ("A layout", "A beam", "An engine", "An effect", "An effect on gains", "A calibrator")
 FEWEST_VARIANTS = {
     "residual": {"components": ["foregrounds", "eor", "noise"], "effects": True, "calibrate": True},
     "eor": {"components": ["eor"]},
