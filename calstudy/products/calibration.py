@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -161,7 +162,7 @@ class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
         result.gains.write_calh5(output / GAINS)
         for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
             write_visibilities(uvd, output / name, single=True)
-        summary = {**result.summary(), "told": remarks}
+        summary = {**result.summary(), "remarks": remarks}
         write_json(output / SOLUTION, summary)
         return {"by_status": summary["by_status"]}
 
@@ -183,14 +184,17 @@ class Calibrate(Task, stage="calibrate", version=2):
         from pyuvdata import UVCal
 
         gains = UVCal.from_file([str(folder / GAINS) for folder in self.chunk], axis="time")
-        gains.write_calh5(output / GAINS)
-        for name in (MODEL, RESIDUAL):
-            parts = [read_visibilities(folder / name) for folder in self.chunk]
-            joined = parts[0].fast_concat(parts[1:], "blt", inplace=False) if len(parts) > 1 else parts[0]
-            write_visibilities(joined, output / name, single=True)
+        if len(self.chunk) == 1:
+            for name in (GAINS, MODEL, RESIDUAL):
+                copyfile(self.chunk[0] / name, output / name)
+        else:
+            gains.write_calh5(output / GAINS)
+            for name in (MODEL, RESIDUAL):
+                first, *others = (read_visibilities(folder / name) for folder in self.chunk)
+                write_visibilities(first.fast_concat(others, "blt", inplace=False), output / name, single=True)
         solutions = [read_json(folder / SOLUTION) for folder in self.chunk]
         records = [record for solution in solutions for record in solution["records"]]
-        remarks = list(dict.fromkeys(text for solution in solutions for text in solution.get("told", [])))
+        remarks = list(dict.fromkeys(text for solution in solutions for text in solution.get("remarks", [])))
         records.sort(key=lambda record: (record["polarization"], record["time"]))
         by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
         for record in records:

@@ -24,8 +24,9 @@ class Realizations(ExperimentStudy):
     """An experiment whose EoR, gains or noise are drawn several times.
 
     Products that several realizations need have one key, and are made once. The first realization is the experiment
-    itself, and shares its products with the experiment's own run. Raises ExperimentError with one sentence per fault of
-    the realizations.
+    itself, and shares its products with the experiment's own run. It is no family of experiments: what is kept are the
+    pooled numbers, and realizations have no folders. Raises ExperimentError with one sentence per fault of the
+    realizations.
     """
 
     key = "realizations"
