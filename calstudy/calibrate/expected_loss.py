@@ -81,14 +81,10 @@ class ExpectedTransfer:
 
     Attributes
     ----------
-    delay
-        Ascending, s, (Ndelays,).
-    transfer
-        T, (Nbls, Ndelays); NaN for baselines without data.
-    error
-        Standard deviation of the stochastic estimate, of the same shape; zero if it is exact.
-    foregrounds, gains
-        Fractions that foregrounds and gains absorb, of the same shape; the three fractions add up to one.
+    delay : ascending, s, (Ndelays,)
+    transfer : T, (Nbls, Ndelays); NaN for baselines without data
+    error : standard deviation of the stochastic estimate, of the same shape; zero if it is exact
+    foregrounds, gains : fractions that these absorb, of the same shape; the three fractions add up to one
     """
 
     delay: np.ndarray = field(metadata={"unit": "s"})
@@ -103,21 +99,14 @@ def expected_transfer(
 ) -> ExpectedTransfer:
     """Predict the fraction of a white signal that a fit preserves, for every baseline and delay.
 
+    Raises ValueError if the exact diagonal of a large problem is requested, or fewer than two probes.
+
     Parameters
     ----------
-    problem
-        The fitted problem.
-    gains, model
-        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    modes
-        The delay modes of its channels.
-    probes
-        Number of random vectors; None for the exact diagonal.
-
-    Raises
-    ------
-    ValueError
-        If the exact diagonal of a large problem is requested, or fewer than two probes.
+    problem : the fitted problem
+    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
+    modes : the delay modes of its channels
+    probes : number of random vectors; None for the exact diagonal
     """
     tangent = TangentSpace.at(problem, gains, model)
     used = tangent.roots > 0
@@ -281,21 +270,14 @@ def linear_response(
 
     It is the difference of the residuals of two fits, of data with the signal and without, if both are at the minimum;
     it does not depend on where these start and stop. Single precision does not resolve it where foregrounds nearly
-    follow the gains.
+    follow the gains. It is complex, (Nbls, Nfreqs), and zero for samples without weight where foregrounds are fitted.
+    Where they are the sky model, the residual has these samples too.
 
     Parameters
     ----------
-    problem
-        The fitted problem.
-    gains, model
-        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    signal
-        Calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model.
-
-    Returns
-    -------
-    Complex, (Nbls, Nfreqs). It is zero for samples without weight where foregrounds are fitted. Where they are the sky
-    model, the residual has these samples too.
+    problem : the fitted problem
+    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
+    signal : calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model
     """
     tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
     left = tangent.without_foregrounds(tangent.roots * signal)

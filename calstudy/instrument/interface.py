@@ -22,10 +22,7 @@ STAND_IN = "beam: {what}, not the MWA full embedded element of Sokolowski et al.
 class AntennaBeam(Protocol):
     """The primary beam of an antenna, as simulations need it.
 
-    Attributes
-    ----------
-    stand_in
-        A note if it is not the beam of the paper, otherwise None.
+    `stand_in` is a note if it is not the beam of the paper, otherwise None.
     """
 
     name: str
@@ -74,8 +71,7 @@ class BeamModel(Plugin, ABC):
 
     Attributes
     ----------
-    dipoles
-        Number of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
+    dipoles : number of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero
     """
 
     registry: ClassVar = BEAMS
@@ -91,17 +87,7 @@ class BeamModel(Plugin, ABC):
     def make_tiles(self, channels: Channels, amplitudes: np.ndarray) -> list[Beam]:
         """Return the beams of tiles with given amplitudes of their dipoles; only if `dipoles` is not zero.
 
-        Parameters
-        ----------
-        channels
-            As for `make`.
-        amplitudes
-            (Ntiles, 2 [x, y], dipoles), one where nominal and zero where dead.
-
-        Raises
-        ------
-        InputError
-            As for `make`.
+        Amplitudes are (Ntiles, 2 [x, y], dipoles), one where nominal and zero where dead. Raises InputError as `make`.
         """
         raise NotImplementedError(f"the beam {self.label} has no dipoles")
 
@@ -114,15 +100,7 @@ class BeamModel(Plugin, ABC):
 
     @abstractmethod
     def make(self, channels: Channels) -> Beam:
-        """Return the beam.
+        """Return the beam for the channels of an observation; it need not be known far outside their band.
 
-        Parameters
-        ----------
-        channels
-            Channels of the observation. The beam need not be known far outside their band.
-
-        Raises
-        ------
-        InputError
-            If a beam file is missing, cannot be read, or does not cover the channels.
+        Raises InputError if a beam file is missing, cannot be read, or does not cover the channels.
         """

@@ -103,10 +103,8 @@ class TabulatedBeam:
 
     Attributes
     ----------
-    zenith_angles : (Nza,) float
-        In radians.
-    tabulated_frequencies : (Ntab,) float
-        Those in the band, and those next to its ends, in Hz.
+    zenith_angles : in rad, (Nza,)
+    tabulated_frequencies : those in the band, and those next to its ends, in Hz, (Ntab,)
     fit_error : largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`
     """
 

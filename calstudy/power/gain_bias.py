@@ -38,8 +38,7 @@ class ErrorCovariance:
 
     Attributes
     ----------
-    channels
-        C at separations of 0, 1, ... N - 1 channels, (N,); N is the number of channels, as of delays.
+    channels : C at separations of 0, 1, ... N - 1 channels, (N,); N is the number of channels, as of delays
     times : R between the integrations of a block, (n, n)
     common : c, from 0 to 1
     """

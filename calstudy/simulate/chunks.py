@@ -152,8 +152,7 @@ def check_interpolation(
     simulate
         Returns the visibilities at the integrations and channels of a template, (Ntimes, Nbls, Nfreqs, Npols): an
         engine's `simulate` with the sky and beam of the simulation.
-    cube : (Ntimes, Nbls, Nfreqs, Npols)
-        Interpolated visibilities at all channels.
+    cube : interpolated visibilities at all channels, (Ntimes, Nbls, Nfreqs, Npols)
     chunk : any chunk of the simulation, for its nodes
     channels : channels to choose from: those of the sky, if it is given channel by channel
     count : number of integrations, and of channels, spread over the observation; each is as far from nodes as possible

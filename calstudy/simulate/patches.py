@@ -98,13 +98,11 @@ class Patches:
 
     Attributes
     ----------
-    components : (N,) int
-        The components in the order of the patches.
+    components : the components in the order of the patches, (N,) int
     tracks : tracks of these components, in this order
     members : slice of the components of each patch
     centres : tracks of the mean directions of the patches, which are fixed points of the sky, as sources are
-    radii : (Npatches,) float
-        Largest distance of a source from the centre of its patch, rad.
+    radii : largest distance of a source from the centre of its patch, rad, (Npatches,)
     """
 
     def __init__(self, sky: SkyModel, tracks: SourceTracks, components: np.ndarray, nside: int) -> None:

@@ -37,8 +37,9 @@ class EorField:
 
     Parameters
     ----------
-    frequencies : (Nfreqs,) float
-        All channel centres of the study in Hz, at least two, increasing and equally spaced; ValueError otherwise.
+    frequencies
+        All channel centres of the study in Hz, at least two, increasing and equally spaced, (Nfreqs,); ValueError
+        otherwise.
     cosmology : converts P(k) to brightness; the power spectrum estimator must use the same cosmology
     """
 

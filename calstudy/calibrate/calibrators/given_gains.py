@@ -192,16 +192,11 @@ class Manifest(Section):
 
     Attributes
     ----------
-    calstudy
-        Version of calstudy that wrote it.
-    digest
-        Digest of all data sets and the sky model; it links the folder to the experiment.
-    sky_model
-        File of the assumed visibilities of the foregrounds; None if nothing is assumed.
-    sky_model_digest
-        Digest of all inputs of the sky model.
-    noise
-        Standard deviation of the complex noise of a sample, Jy; None if the data have none.
+    calstudy : version of calstudy that wrote it
+    digest : digest of all data sets and the sky model; it links the folder to the experiment
+    sky_model : file of the assumed visibilities of the foregrounds; None if nothing is assumed
+    sky_model_digest : digest of all inputs of the sky model
+    noise : standard deviation of the complex noise of a sample, Jy; None if the data have none
     """
 
     calstudy: str
