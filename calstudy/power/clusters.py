@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calstudy.power.spectra import DelaySpectra, bins_of_k, outside_wedge
+from calstudy.power.spectra import DelaySpectra, bins_of_k
 
 LARGEST_PART = 0.5
 """Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""
@@ -191,7 +191,6 @@ def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, insid
 
     `edges` are as in `calstudy.power.spectra.bins_of_k`. Modes with |tau| <= |b|/c + `buffer` (s) are inside the wedge.
     """
-    bins = bins_of_k(spectra, edges)
-    bins[outside_wedge(spectra, buffer) == inside] = -1
+    bins = bins_of_k(spectra, edges, buffer, inside)
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
     return Clusters.of(spectra, bins, samples, edges.size - 1)

@@ -201,13 +201,18 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
     return np.abs(modes.delay) > horizon[:, None] + buffer
 
 
-def bins_of_k(modes: DelaySpectra | BaselineModes, edges: np.ndarray) -> np.ndarray:
+def bins_of_k(
+    modes: DelaySpectra | BaselineModes, edges: np.ndarray, buffer: float | None = None, inside: bool = False
+) -> np.ndarray:
     """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those in none.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge.
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. With a buffer, s, bins
+    hold only modes outside the wedge (`outside_wedge`), or only those `inside`.
     """
     bins = np.searchsorted(edges, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
     bins[bins >= edges.size - 1] = -1
+    if buffer is not None:
+        bins[outside_wedge(modes, buffer) == inside] = -1
     return bins
 
 
