@@ -71,14 +71,9 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Baselines:
-    """Antennas, lengths and channels of the baselines.
+    """Rows of the two antennas of each baseline among the gains, (Nbls, 2), their lengths in m, (Nbls,), and channels.
 
-    Attributes
-    ----------
-    antennas : rows of the two antennas among the gains, (Nbls, 2)
-    lengths : |b| in m, (Nbls,)
-    frequency : channel centres, Hz, (Nfreqs,)
-    buffer : delay, s, that is added to the horizon delay; the wedge ends there
+    Channel centres are in Hz, (Nfreqs,). The wedge ends at a delay of the horizon plus `buffer`, s.
     """
 
     antennas: np.ndarray
@@ -299,12 +294,10 @@ def pulls(errors: GainErrors, gains: np.ndarray, true: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True)
 class GainCoverage:
-    """Fractions of the pulls of several solves.
+    """Fractions of the pulls of several solves, NaN for antennas without errors.
 
-    Attributes
-    ----------
-    observed : of amplitudes and of phases within the limits of the fractions `EXPECTED`, (Nsolves, 2, Nexpected)
-    within : the same of each antenna within `LIMITS`, (Nsolves, 2, Nants, 2); NaN for antennas without errors
+    `observed` are those of amplitudes and of phases within the limits of the fractions `EXPECTED`, (Nsolves, 2,
+    Nexpected), and `within` the same of each antenna within `LIMITS`, (Nsolves, 2, Nants, 2).
     """
 
     observed: np.ndarray

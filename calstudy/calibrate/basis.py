@@ -31,14 +31,10 @@ GRID_TOLERANCE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Bucket:
-    """Models that share one basis.
+    """Models, by their indices `members`, (Nmembers,), that share one basis, up to the delay `half_width` in s.
 
-    Attributes
-    ----------
-    half_width : largest modelled delay, in s
-    members : indices of the models in this bucket, shape (Nmembers,)
-    vectors
-        Orthonormal sequences, shape (Nfreqs, Nvec), float64; with a prior, a root of the covariance of the foregrounds.
+    `vectors` are orthonormal sequences, (Nfreqs, Nvec), float64; with a prior, a root of the covariance of the
+    foregrounds.
     """
 
     half_width: float

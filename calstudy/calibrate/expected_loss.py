@@ -99,14 +99,9 @@ def expected_transfer(
 ) -> ExpectedTransfer:
     """Predict the fraction of a white signal that a fit preserves, for every baseline and delay.
 
-    Raises ValueError if the exact diagonal of a large problem is requested, or fewer than two probes.
-
-    Parameters
-    ----------
-    problem : the fitted problem
-    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
-    modes : the delay modes of its channels
-    probes : number of random vectors; None for the exact diagonal
+    The solution of the fitted problem is complex, (Nants, Nfreqs) and (Nbls, Nfreqs); `modes` are those of its
+    channels. `probes` is the number of random vectors, None for the exact diagonal. Raises ValueError if the latter is
+    requested for a large problem, or fewer than two probes.
     """
     tangent = TangentSpace.at(problem, gains, model)
     used = tangent.roots > 0
@@ -273,11 +268,8 @@ def linear_response(
     follow the gains. It is complex, (Nbls, Nfreqs), and zero for samples without weight where foregrounds are fitted.
     Where they are the sky model, the residual has these samples too.
 
-    Parameters
-    ----------
-    problem : the fitted problem
-    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
-    signal : calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model
+    The solution of the fitted problem is complex, (Nants, Nfreqs) and (Nbls, Nfreqs). The signal has the unit of the
+    model, (Nbls, Nfreqs).
     """
     tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
     left = tangent.without_foregrounds(tangent.roots * signal)

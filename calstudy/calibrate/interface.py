@@ -89,13 +89,10 @@ class Calibration:
 
 @dataclass(frozen=True)
 class SolvePlan:
-    """Properties of a calibration that are known before it starts.
+    """Properties of a calibration that are known before it starts: the cost of all its solves, details and notes.
 
-    Attributes
-    ----------
-    cost : cost of all its solves
-    details : details worth reporting besides the dimensions of the data, such as "640 foreground coefficients each"
-    notes : sentences on settings that will not work well
+    Details are worth reporting besides the dimensions of the data, such as "640 foreground coefficients each". Notes
+    are sentences on settings that will not work well.
     """
 
     cost: Cost

@@ -67,11 +67,8 @@ def model_of(section: Plugin) -> BeamModel:
 class BeamModel(Plugin, ABC):
     """The settings of a beam, from which the beam is made. Fields of a subclass are its settings.
 
-    Its module is imported when an experiment file is read: import slow libraries inside `make`.
-
-    Attributes
-    ----------
-    dipoles : number of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero
+    Its module is imported when an experiment file is read: import slow libraries inside `make`. `dipoles` is the number
+    of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
     """
 
     registry: ClassVar = BEAMS

@@ -106,10 +106,8 @@ class Layout:
 class ArrayLayout(Plugin, ABC):
     """The settings of a layout, from which positions are made. Fields of a subclass are its settings.
 
-    Attributes
-    ----------
-    site : name of the site of the array unless `instrument.location` gives another; None if it must
-    regular : whether antennas are on a flat lattice, which fast simulations use
+    `site` is the name of the site of the array unless `instrument.location` gives another; None if it must. `regular`
+    is whether antennas are on a flat lattice, which fast simulations use.
     """
 
     registry: ClassVar = LAYOUTS

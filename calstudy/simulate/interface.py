@@ -69,14 +69,10 @@ class Engine(Plugin, ABC):
     def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
 
-        It is called only with arguments that `refusal` accepts. The uncalibrated drift-scan visibilities are in Jy,
-        V_xx = 1/2 int A I, in the template's order, (Ntimes, Nbls, Nfreqs, Npols) complex128.
-
-        Parameters
-        ----------
-        sky : points or HEALPix, in Jy or K, of any spectral type
-        beam : one for all antennas, or `AntennaBeams`
-        template : rectangular observation without data (see `calstudy.base.visibilities`)
+        It is called only with arguments that `refusal` accepts: a sky of points or HEALPix, in Jy or K, of any spectral
+        type; a beam for all antennas, or `AntennaBeams`; and a rectangular observation without data
+        (`calstudy.base.visibilities`). The uncalibrated drift-scan visibilities are in Jy, V_xx = 1/2 int A I, in the
+        template's order, (Ntimes, Nbls, Nfreqs, Npols) complex128.
         """
 
     def interpolate(

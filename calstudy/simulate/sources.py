@@ -33,18 +33,14 @@ def is_polarized(sky: SkyModel) -> bool:
 def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
     """Return Stokes I of a sky in Jy, (Nfreqs, Ncomponents), with the same conventions as pyuvsim.
 
-    Flux densities that are the same at all frequencies are a read-only view that does not repeat them in memory.
+    The sky has points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type. Frequencies are in Hz, (Nfreqs,);
+    `components` are indices, all by default. Flux densities that are the same at all frequencies are a read-only view
+    that does not repeat them in memory.
 
     HEALPix pixels count as points that hold the pixel's integral, and brightness temperatures are converted at the
     reference frequency of a spectral-index or flat component, or else at each frequency (Rayleigh-Jeans). Raises
     InputError if a spectral index is not a number, a `full` sky lacks one of the frequencies, or a `subband` sky does
     not span them.
-
-    Parameters
-    ----------
-    sky : points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type
-    frequencies : in Hz, (Nfreqs,)
-    components : indices of the components, all by default
     """
     if sky.spectral_type == "subband":
         sky = sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False)

@@ -35,12 +35,8 @@ class EorField:
     the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power law). A delay spectrum
     therefore recovers P itself. In the flat case the brightness is constant within a pixel.
 
-    Parameters
-    ----------
-    frequencies
-        All channel centres of the study in Hz, at least two, increasing and equally spaced, (Nfreqs,); ValueError
-        otherwise.
-    cosmology : converts P(k) to brightness; the power spectrum estimator must use the same cosmology
+    `frequencies` are all channel centres of the study in Hz, at least two, increasing and equally spaced, (Nfreqs,);
+    ValueError otherwise. The cosmology converts P(k) to brightness; the power spectrum estimator must use the same.
     """
 
     def __init__(self, settings: Eor, frequencies: np.ndarray, cosmology: FLRW = Planck15) -> None:
