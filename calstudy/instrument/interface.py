@@ -55,8 +55,8 @@ class AntennaBeams:
     @property
     def stand_in(self) -> str | None:
         """The note on the beam of `instrument.beam`, and the number of antennas with other beams."""
-        others = f"antennas with another: {int((self.index > 0).sum())}"
-        return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
+        first = self.beams[0].stand_in or f"beam: {self.beams[0].name}"
+        return f"{first}; antennas with another: {int((self.index > 0).sum())}"
 
 
 def model_of(section: Plugin) -> BeamModel:

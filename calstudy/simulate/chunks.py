@@ -230,10 +230,9 @@ class Component:
     def accuracy(self) -> Accuracy:
         """Tolerance of the interpolation, and whether beam and sky are smooth in frequency."""
         beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
-        smooth_beam, nodes = all(model_of(beam).smooth for beam in beams), self.simulation.nodes
-        if self.is_eor:
-            return nodes.for_eor(smooth_beam)
-        return nodes.for_foregrounds(smooth_beam, smooth_sky=self._foregrounds.spectral_type in SMOOTH_SPECTRA)
+        smooth_beam = all(model_of(beam).smooth for beam in beams)
+        smooth_sky = not self.is_eor and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+        return self.simulation.nodes.accuracy(self.is_eor, smooth_beam, smooth_sky)
 
     @cached_property
     def chunks(self) -> list[Chunk]:

@@ -134,14 +134,11 @@ class FileSources(PointSources):
     csv: CsvColumns | None = Field(None, description="Required for a CSV (.csv).")
 
     @model_validator(mode="after")
-    def _csv_has_columns(self) -> FileSources:
-        if (self.path.suffix.lower() == ".csv") != (self.csv is not None):
+    def _tables_have_columns(self) -> FileSources:
+        suffix = self.path.suffix.lower()
+        if (suffix == ".csv") != (self.csv is not None):
             raise fault("csv", "is required for CSV files (.csv), and not allowed for other files")
-        return self
-
-    @model_validator(mode="after")
-    def _votables_have_columns(self) -> FileSources:
-        if (self.path.suffix.lower() in VOTABLE_SUFFIXES) != (self.votable is not None):
+        if (suffix in VOTABLE_SUFFIXES) != (self.votable is not None):
             suffixes = ", ".join(VOTABLE_SUFFIXES)
             raise fault("votable", f"is required for VOTables ({suffixes}), and not allowed for other files")
         return self
