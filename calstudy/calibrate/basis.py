@@ -194,11 +194,7 @@ def _grid_of(frequencies: np.ndarray, band: slice) -> ChannelGrid:
 
 
 def make_basis(
-    lengths: np.ndarray,
-    frequencies: np.ndarray,
-    settings: BasisSettings,
-    prior: bool = False,
-    band: slice = WHOLE_BAND,
+    lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings, prior: bool = False, band: slice = WHOLE_BAND
 ) -> ForegroundBasis:
     """Build the foreground basis of models with the given baseline lengths (paper Eq. FGMODEL).
 

@@ -220,11 +220,7 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
 
 
 def redundant_start(
-    data: Observation,
-    weights: np.ndarray,
-    settings: RedundantStart,
-    tolerance: float,
-    sky: np.ndarray | None = None,
+    data: Observation, weights: np.ndarray, settings: RedundantStart, tolerance: float, sky: np.ndarray | None = None
 ) -> np.ndarray:
     """Solve redundant baselines for gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
 
@@ -298,9 +294,7 @@ def _solve(
 
 
 def _along_sky(
-    reds: list[list[Key]],
-    overlap: dict[Key, np.ndarray],
-    gains: dict[int, np.ndarray],
+    reds: list[list[Key]], overlap: dict[Key, np.ndarray], gains: dict[int, np.ndarray]
 ) -> dict[int, np.ndarray]:
     """Return gains with the phase gradient of the sky model; `overlap` are weighted data times its conjugate."""
     from hera_cal.abscal import complex_phase_abscal

@@ -119,8 +119,7 @@ class NoNoise(Section):
 
 
 Noise = Annotated[
-    NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise,
-    choice("kind", "times-eor"),
+    NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise, choice("kind", "times-eor")
 ]
 
 

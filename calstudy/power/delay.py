@@ -10,12 +10,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
-TAPERS = {
-    "blackman-harris": "blackmanharris",
-    "hann": "hann",
-    "tukey": "tukey",
-    "none": "boxcar",
-}
+TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "boxcar"}
 """The tapers of `calstudy.power.settings.PowerSettings`, and their names in scipy.signal.windows."""
 
 

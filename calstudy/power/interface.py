@@ -168,12 +168,7 @@ def _fault(found: object) -> str | None:
     if not isinstance(found, DelaySpectra):
         return f"returned a {type(found).__name__}, expected DelaySpectra"
     units, n_delays = len(found.n_pairs), len(found.delay)
-    expected = {
-        "power": (units, n_delays),
-        "vectors": (units, 3),
-        "k_perp": (units,),
-        "k_parallel": (n_delays,),
-    }
+    expected = {"power": (units, n_delays), "vectors": (units, 3), "k_perp": (units,), "k_parallel": (n_delays,)}
     for name, shape in expected.items():
         values = getattr(found, name)
         if values.shape != shape:

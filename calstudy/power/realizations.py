@@ -208,9 +208,7 @@ def _one(sample: Sample) -> np.ndarray:
 
 QUANTITIES = {
     "ratio": Quantity(
-        "P^R / P^S",
-        lambda s: _over_eor(s.residual.power.real, s),
-        lambda s: _over_eor(s.residual.difference_error, s),
+        "P^R / P^S", lambda s: _over_eor(s.residual.power.real, s), lambda s: _over_eor(s.residual.difference_error, s)
     ),
     "bias": Quantity(
         "P^R0 / P^S", lambda s: _over_eor(s.without_eor.power.real, s), lambda s: _over_eor(s.without_eor.error, s)

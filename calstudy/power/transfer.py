@@ -410,12 +410,7 @@ class ExpectedBins:
 
 
 def bin_expected(
-    modes: BaselineModes,
-    transfer: np.ndarray,
-    error: np.ndarray,
-    edges: ArrayLike,
-    buffer: float,
-    length_bin: float,
+    modes: BaselineModes, transfer: np.ndarray, error: np.ndarray, edges: ArrayLike, buffer: float, length_bin: float
 ) -> ExpectedBins:
     """Average the expected transfer function, (Nbls, Ndelays), and its error over bins; NaN without data.
 
@@ -448,11 +443,7 @@ def bin_expected(
 
 
 def bin_response(
-    modes: BaselineModes,
-    signal: np.ndarray,
-    responses: tuple[np.ndarray, np.ndarray],
-    edges: ArrayLike,
-    buffer: float,
+    modes: BaselineModes, signal: np.ndarray, responses: tuple[np.ndarray, np.ndarray], edges: ArrayLike, buffer: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return T = Re <D* D'> / P^S and C = Re <S* (D + D')> / 2 P^S outside the wedge, (Nk,) each; NaN without signal.
 

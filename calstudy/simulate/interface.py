@@ -106,11 +106,7 @@ class Engine(Plugin, ABC):
 
 
 def simulate_with(
-    engine: Engine,
-    sky: SkyModel,
-    beam: AntennaBeam | AntennaBeams,
-    template: UVData,
-    accuracy: Accuracy = EXACT,
+    engine: Engine, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy = EXACT
 ) -> np.ndarray:
     """Simulate visibilities with an engine and check them, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 

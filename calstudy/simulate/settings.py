@@ -33,9 +33,7 @@ class Nodes(Section):
         "hundredth of it.",
     )
     beam_extent: Length = Field(
-        20.0,
-        ge=10,
-        description="Length added to baselines for the structure of the beam in fringe rate and delay.",
+        20.0, ge=10, description="Length added to baselines for the structure of the beam in fringe rate and delay."
     )
 
     def accuracy(self, eor: bool, smooth_beam: bool = True, smooth_sky: bool = True) -> Accuracy:

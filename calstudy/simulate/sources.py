@@ -17,12 +17,7 @@ from pyradiosky.utils import jy_to_ksr
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import use_bundled_earth_orientation
-from calstudy.simulate.nodes import (
-    EARTH_ROTATION_RATE,
-    chebyshev_count,
-    chebyshev_nodes,
-    interpolation_matrix,
-)
+from calstudy.simulate.nodes import EARTH_ROTATION_RATE, chebyshev_count, chebyshev_nodes, interpolation_matrix
 
 
 def is_polarized(sky: SkyModel) -> bool:

@@ -32,9 +32,7 @@ class CatalogueErrors(Section):
         0.0, ge=0, description="Standard deviation of the relative error of each flux, constant over the band."
     )
     position_scatter: Angle = Field(
-        0.0,
-        ge=0,
-        description="Standard deviation of the error of each position, in each of two directions.",
+        0.0, ge=0, description="Standard deviation of the error of each position, in each of two directions."
     )
     index_scatter: float = Field(
         0.0, ge=0, description="Standard deviation of the error of each spectral index, about the flux at 200 MHz."
@@ -173,8 +171,7 @@ class NoSources(Section):
 
 
 Foregrounds = Annotated[
-    GleamSources | SyntheticSources | FileSources | CodeSources | NoSources,
-    choice("kind", "g4jy-and-counts"),
+    GleamSources | SyntheticSources | FileSources | CodeSources | NoSources, choice("kind", "g4jy-and-counts")
 ]
 
 
