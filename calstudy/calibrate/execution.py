@@ -48,8 +48,7 @@ def smooth(
     """Smooth gains, (Nants, Nfreqs, Ntimes, Npols); flagged ones have no influence and stay as they are.
 
     Channels and integrations are those of `data`; `numbers` are those of the antennas, (Nants,). Raises InputError if
-    the reference antenna has no gains, if channels or integrations are not even where they must be, or if there are too
-    few integrations.
+    the reference antenna has no gains, or if channels or integrations are not even where they must be, or too few.
     """
     values = np.where(flags, 0, gains)
     if settings.reference_antenna is not None:
@@ -228,13 +227,10 @@ def _require_usable(sky_model: Observation, data: Observation) -> None:
         raise InputError("the sky model is not finite where the data are not flagged")
 
 
-def _name(calibrator: Calibrator) -> str:
-    file = FILE_REFERENCE.fullmatch(calibrator.reference)
-    return (calibrator.reference or type(calibrator).__name__) if file is None else Path(file["path"]).name
-
-
 def _where(calibrator: Calibrator) -> str:
-    return f"calibration.calibrator = {_name(calibrator)!r}"
+    file = FILE_REFERENCE.fullmatch(calibrator.reference)
+    name = Path(file["path"]).name if file is not None else calibrator.reference or type(calibrator).__name__
+    return f"calibration.calibrator = {name!r}"
 
 
 class _Returned:

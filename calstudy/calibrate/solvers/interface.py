@@ -82,8 +82,7 @@ def solve_warm(
     """Solve one problem from a warm start, and return the solution with the warm start for the next.
 
     The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). A lack of convergence is a status,
-    not an error; after a failed solve there is no warm start. With `warm` of None the solve starts from the problem's
-    initial gains.
+    not an error; after a failed solve there is no warm start. By default the solve starts from the initial gains.
     """
     started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)

@@ -273,8 +273,7 @@ class CoordinateInverse(NamedTuple):
 def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Tensor) -> CoordinateInverse:
     """Invert the damped blocks for gains in a space of smooth ones.
 
-    `columns` are the relative changes of each antenna's gain for a unit of each coordinate, (Nants, Nfreqs, Ngain),
-    complex64.
+    `columns` are relative changes of gains for a unit of each coordinate, (Nants, Nfreqs, Ngain), complex64.
     """
     diagonal = tf.cast((1 + damping) * blocks.degrees, columns.dtype)
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
