@@ -230,8 +230,7 @@ class Realization:
     The residual of a fit is noise, the signal, and an error e. The part of e that two noise realizations share survives
     the cross power of even and odd: it is the bias of P^R. Here the noise is known, and is subtracted to find e.
 
-    Visibilities are as measured, gains included; the noise is before the gains, and `gain_products` are the true g_a
-    g_b*.
+    Visibilities are as measured, gains included; the noise is before the gains, and `gain_products` are the true ones.
     """
 
     visibilities: np.ndarray
@@ -280,8 +279,7 @@ PARTS = ("amplitude", "phase")
 def pulls(errors: GainErrors, gains: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return deviations from the true gains over their errors, of amplitudes and phases, (2, Nants, Nfreqs).
 
-    Gains are complex, (Nants, Nfreqs). What errors leave out is taken out of the deviations. NaN for gains without
-    error.
+    Gains are complex, (Nants, Nfreqs). What errors leave out is taken out of the deviations. NaN without an error.
     """
     known = np.isfinite(errors.phase)
     ratio = np.divide(gains, true, out=np.ones(gains.shape, complex), where=known)

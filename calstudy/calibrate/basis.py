@@ -33,8 +33,7 @@ GRID_TOLERANCE = 0.05
 class Bucket:
     """Models, by their indices `members`, (Nmembers,), that share one basis, up to the delay `half_width` in s.
 
-    `vectors` are orthonormal sequences, (Nfreqs, Nvec), float64; with a prior, a root of the covariance of the
-    foregrounds.
+    `vectors` are orthonormal sequences, (Nfreqs, Nvec), float64; with a prior, a root of its covariance.
     """
 
     half_width: float
@@ -67,8 +66,7 @@ class ForegroundBasis:
 def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarray:
     """Compute the largest modelled delay of each baseline, shape (Nmodels,), in s, for `lengths` in m.
 
-    It is ``max(horizon * length / c, min_delay) + buffer``, rounded up to a multiple of `delay_step`; autocorrelations
-    have length zero.
+    It is ``max(horizon * length / c, min_delay) + buffer``, rounded up to a multiple of `delay_step`.
     """
     reach = np.maximum(settings.horizon * np.asarray(lengths, float) / SPEED_OF_LIGHT, settings.min_delay)
     # Without the inner rounding, binary dust would push exact multiples up by a whole step.

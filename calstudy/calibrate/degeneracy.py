@@ -42,8 +42,7 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
     large, by the square of their relative rms. ``sky-model`` corrects that.
 
     Gains and model are as fitted, complex, (Nants, Nfreqs) and (Nbls, Nfreqs). Raises ValueError if no positive scale
-    exists: the summed model vanishes or opposes the summed sky model, or the data are not correlated with the sky
-    model.
+    exists: the summed model vanishes or opposes the summed sky model, or the data are not correlated with it.
     """
     if problem.prior == "none" or problem.frozen:
         return 1.0

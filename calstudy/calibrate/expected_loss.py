@@ -268,8 +268,7 @@ def linear_response(
     follow the gains. It is complex, (Nbls, Nfreqs), and zero for samples without weight where foregrounds are fitted.
     Where they are the sky model, the residual has these samples too.
 
-    The solution of the fitted problem is complex, (Nants, Nfreqs) and (Nbls, Nfreqs). The signal has the unit of the
-    model, (Nbls, Nfreqs).
+    The solution is complex, (Nants, Nfreqs) and (Nbls, Nfreqs); the signal is like the model and in its unit.
     """
     tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
     left = tangent.without_foregrounds(tangent.roots * signal)

@@ -154,8 +154,7 @@ def gain_errors(
     """Compute the errors of gains by noise, or say in a sentence why there are none.
 
     The fitted problem has the weights of its last pass; its solution is complex, (Nants, Nfreqs) and (Nbls, Nfreqs).
-    Frequencies are channel centres, Hz, (Nfreqs,). `absorbed` is what foregrounds absorb, as of a similar problem; by
-    default it is computed.
+    Frequencies are channel centres, Hz, (Nfreqs,). `absorbed` is that of a similar problem; by default it is computed.
     """
     structure = problem.structure
     if structure.gain_vectors is not None:

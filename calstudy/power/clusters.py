@@ -144,8 +144,7 @@ class Sums:
 def linear_error(terms: tuple[tuple[np.ndarray, Sums], ...]) -> np.ndarray:
     """Return the standard deviation of a linear combination of totals whose deviations add up to zero in each bin.
 
-    `terms` are factors, (n_bins,), and the sums that they multiply. The error, (n_bins,), is NaN in bins of one sample,
-    whose scatter is not known.
+    `terms` are factors, (n_bins,), and the sums that they multiply. The error, (n_bins,), is NaN in bins of one sample.
     """
     clusters = terms[0][1].clusters
     share_owner = clusters.owner[clusters.share_sample]

@@ -22,8 +22,7 @@ WITHIN = 0.5
 class Limits:
     """The upper limits of a publication at one redshift, that of the middle of their band.
 
-    They have a name and a reference. k is ascending, h/Mpc, (Nk,), and `delta2` are upper limits of Delta^2, mK^2,
-    (Nk,).
+    k is ascending, h/Mpc, (Nk,), and `delta2` are upper limits of Delta^2, mK^2, (Nk,).
     """
 
     name: str

@@ -186,8 +186,7 @@ class SphericalSpectrum:
     def difference_error(self) -> np.ndarray:
         """Standard deviation of P - P_S, (Nk,), where the EoR that P contains is the one whose power is P_S.
 
-        Both contain the sample variance of a mode (`calstudy.power.binned`). The noise remains, and the product of
-        signal and noise.
+        Both contain the sample variance of a mode (`calstudy.power.binned`). Noise and its product with signal remain.
         """
         noise, sample = self.noise_error, self.sample_error
         modes = np.sqrt(2 * self.noise_modes * self.sample_modes)
@@ -275,8 +274,7 @@ def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelayS
 def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
     """Gather the pairs of a `UVPSpec` of `calstudy.power.estimate.estimate_power` into units.
 
-    `settings` hold the taper and cosmology with which `uvp` was made. Raise ValueError if it has several spectral
-    windows or times.
+    `settings` are those with which it was made. Raise ValueError if it has several spectral windows or times.
     """
     if uvp.Nspws != 1 or uvp.Nbltpairs != uvp.Nblpairs:
         raise ValueError(f"the spectra have {uvp.Nspws} spectral windows and {uvp.Ntpairs} times, expected 1 and 1")

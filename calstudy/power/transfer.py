@@ -414,8 +414,7 @@ def bin_expected(
 ) -> ExpectedBins:
     """Average the expected transfer function, (Nbls, Ndelays), and its error over bins; NaN without data.
 
-    `edges` and `buffer` are as in `calstudy.power.clusters.clusters_in_k`. `length_bin` is the width of the bins of
-    baseline length, m.
+    `edges` and `buffer` are as in `calstudy.power.clusters.clusters_in_k`. `length_bin` is a width, m.
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)

@@ -100,8 +100,7 @@ def simulate_chunk(
 ) -> np.ndarray:
     """Simulate a chunk in Jy at all integrations and at its frequency nodes, (Ntimes, Nbls, Nf, Npols) complex128.
 
-    `template` is the whole observation. `sky` is the whole sky; if it is given channel by channel, it needs only the
-    channels of the chunk.
+    Template and sky are the whole ones; a sky that is given channel by channel needs only the channels of the chunk.
     """
     frame = subset_template(template, integration_times(template), chunk.frequencies)
     part = chunk.select(sky)

@@ -34,8 +34,7 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | sl
 
     HEALPix pixels count as points that hold the pixel's integral, and brightness temperatures are converted at the
     reference frequency of a spectral-index or flat component, or else at each frequency (Rayleigh-Jeans). Raises
-    InputError if a spectral index is not a number, a `full` sky lacks one of the frequencies, or a `subband` sky does
-    not span them.
+    InputError if a spectral index is not a number, or the sky lacks one of the frequencies.
     """
     if sky.spectral_type == "subband":
         sky = sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False)
