@@ -263,7 +263,7 @@ class _Returned:
         """Return a mask of the calibration, bool, which must have this shape and at least so many marks."""
         mask = np.asarray(values)
         self._require(
-            mask.dtype == bool and mask.shape == shape and np.count_nonzero(mask) >= least,
+            mask.dtype == bool and mask.shape == shape and int(np.count_nonzero(mask)) >= least,
             f"returns {name} of shape {mask.shape} and type {mask.dtype}, expected bool of shape {shape}"
             + (" with at least one True" if least else ""),
         )
