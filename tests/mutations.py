@@ -112,7 +112,12 @@ MUTATIONS = (
         'modes.k_parallel), side="left")',
         SPECTRA,
     ),
-    Mutation("the wedge inverted", "bins[~outside_wedge(", "bins[outside_wedge(", SPECTRA),
+    Mutation(
+        "the wedge inverted",
+        "bins[outside_wedge(modes, buffer) == inside]",
+        "bins[outside_wedge(modes, buffer) != inside]",
+        SPECTRA,
+    ),
     Mutation("the wedge without its buffer", "horizon[:, None] + buffer", "horizon[:, None]", (*SPECTRA, *SCORES)),
     Mutation(
         "T without the flux scale",

@@ -71,14 +71,9 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Baselines:
-    """Antennas, lengths and channels of the baselines.
+    """Rows of the two antennas of each baseline among the gains, (Nbls, 2), their lengths in m, (Nbls,), and channels.
 
-    Attributes
-    ----------
-    antennas : rows of the two antennas among the gains, (Nbls, 2)
-    lengths : |b| in m, (Nbls,)
-    frequency : channel centres, Hz, (Nfreqs,)
-    buffer : delay, s, that is added to the horizon delay; the wedge ends there
+    Channel centres are in Hz, (Nfreqs,). The wedge ends at a delay of the horizon plus `buffer`, s.
     """
 
     antennas: np.ndarray
@@ -235,8 +230,7 @@ class Realization:
     The residual of a fit is noise, the signal, and an error e. The part of e that two noise realizations share survives
     the cross power of even and odd: it is the bias of P^R. Here the noise is known, and is subtracted to find e.
 
-    Visibilities are as measured, gains included; the noise is before the gains, and `gain_products` are the true g_a
-    g_b*.
+    Visibilities are as measured, gains included; the noise is before the gains, and `gain_products` are the true ones.
     """
 
     visibilities: np.ndarray
@@ -285,8 +279,7 @@ PARTS = ("amplitude", "phase")
 def pulls(errors: GainErrors, gains: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return deviations from the true gains over their errors, of amplitudes and phases, (2, Nants, Nfreqs).
 
-    Gains are complex, (Nants, Nfreqs). What errors leave out is taken out of the deviations. NaN for gains without
-    error.
+    Gains are complex, (Nants, Nfreqs). What errors leave out is taken out of the deviations. NaN without an error.
     """
     known = np.isfinite(errors.phase)
     ratio = np.divide(gains, true, out=np.ones(gains.shape, complex), where=known)
@@ -299,12 +292,10 @@ def pulls(errors: GainErrors, gains: np.ndarray, true: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True)
 class GainCoverage:
-    """Fractions of the pulls of several solves.
+    """Fractions of the pulls of several solves, NaN for antennas without errors.
 
-    Attributes
-    ----------
-    observed : of amplitudes and of phases within the limits of the fractions `EXPECTED`, (Nsolves, 2, Nexpected)
-    within : the same of each antenna within `LIMITS`, (Nsolves, 2, Nants, 2); NaN for antennas without errors
+    `observed` are those of amplitudes and of phases within the limits of the fractions `EXPECTED`, (Nsolves, 2,
+    Nexpected), and `within` the same of each antenna within `LIMITS`, (Nsolves, 2, Nants, 2).
     """
 
     observed: np.ndarray

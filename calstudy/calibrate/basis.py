@@ -31,14 +31,9 @@ GRID_TOLERANCE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Bucket:
-    """Models that share one basis.
+    """Models, by their indices `members`, (Nmembers,), that share one basis, up to the delay `half_width` in s.
 
-    Attributes
-    ----------
-    half_width : largest modelled delay, in s
-    members : indices of the models in this bucket, shape (Nmembers,)
-    vectors
-        Orthonormal sequences, shape (Nfreqs, Nvec), float64; with a prior, a root of the covariance of the foregrounds.
+    `vectors` are orthonormal sequences, (Nfreqs, Nvec), float64; with a prior, a root of its covariance.
     """
 
     half_width: float
@@ -71,8 +66,7 @@ class ForegroundBasis:
 def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarray:
     """Compute the largest modelled delay of each baseline, shape (Nmodels,), in s, for `lengths` in m.
 
-    It is ``max(horizon * length / c, min_delay) + buffer``, rounded up to a multiple of `delay_step`; autocorrelations
-    have length zero.
+    It is ``max(horizon * length / c, min_delay) + buffer``, rounded up to a multiple of `delay_step`.
     """
     reach = np.maximum(settings.horizon * np.asarray(lengths, float) / SPEED_OF_LIGHT, settings.min_delay)
     # Without the inner rounding, binary dust would push exact multiples up by a whole step.
@@ -198,11 +192,7 @@ def _grid_of(frequencies: np.ndarray, band: slice) -> ChannelGrid:
 
 
 def make_basis(
-    lengths: np.ndarray,
-    frequencies: np.ndarray,
-    settings: BasisSettings,
-    prior: bool = False,
-    band: slice = WHOLE_BAND,
+    lengths: np.ndarray, frequencies: np.ndarray, settings: BasisSettings, prior: bool = False, band: slice = WHOLE_BAND
 ) -> ForegroundBasis:
     """Build the foreground basis of models with the given baseline lengths (paper Eq. FGMODEL).
 

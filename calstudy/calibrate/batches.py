@@ -36,11 +36,8 @@ ALIKE = 4
 class Batch(NamedTuple):
     """Consecutive models whose foregrounds are eliminated at once.
 
-    Attributes
-    ----------
-    models, baselines : first one and one past the last, in the solvers' order
-    bases : the different bases of these models, (Nfreqs, Nvec) each, float64
-    basis_index : index of the basis of each model, (Nmodels,), ascending
+    Models and baselines are given by the first one and one past the last, in the solvers' order. `bases` are their
+    different bases, (Nfreqs, Nvec) each, float64, and `basis_index` is that of each model, (Nmodels,), ascending.
     """
 
     models: tuple[int, int]

@@ -54,12 +54,7 @@ def make_solver(settings: GainFit, tolerance: float | None = None) -> Solver:
     return Adamax(**solver.model_dump(exclude={"name", "warm_start"}))
 
 
-def fit(
-    observation: Observation,
-    assumed: Assumed,
-    settings: GainFit,
-    progress: Progress | None = None,
-) -> Calibration:
+def fit(observation: Observation, assumed: Assumed, settings: GainFit, progress: Progress | None = None) -> Calibration:
     """Solve for gains and foregrounds, independently for every polarization and every integration or group of them.
 
     Flagged samples have no influence. Autocorrelations are left out, also of the results, unless `settings.autos` is

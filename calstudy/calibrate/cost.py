@@ -163,28 +163,21 @@ def _seconds(settings: GainFit, solves: float, samples: int) -> float:
         passes, each = (PASSES, PASSES_SECONDS) if isinstance(settings.weights, GainWeights) else (1.0, 0.0)
         if settings.estimates_deviation:
             passes, each = PASSES, SEARCH_SECONDS
-        cold, seconds = _cold_seconds(settings) * passes, _warm_seconds(settings, solver.tolerance)
+        cold, seconds = _solve_seconds(settings, solver.tolerance)
         # Cost of the normal matrices, baselines x channels x vectors^2, dominates.
-        return START_SECONDS + each * solves + ((solves - warm) * max(cold, seconds) + warm * seconds) * work
+        return START_SECONDS + each * solves + ((solves - warm) * max(cold * passes, seconds) + warm * seconds) * work
     return 6 + ADAMAX_STEP * work * solves * solver.max_steps
 
 
-def _cold_seconds(settings: GainFit) -> float:
-    """Return the seconds of a first Gauss-Newton solve of the paper's samples, in one pass."""
+def _solve_seconds(settings: GainFit, tolerance: float) -> tuple[float, float]:
+    """Return the seconds of Gauss-Newton solves of the paper's samples: a first one, in one pass, and a later one."""
     if not isinstance(settings, ForegroundFit) or settings.frozen:
-        return FROZEN_COLD
-    return FINITE_COLD if settings.foreground_prior.finite else FREE_COLD
-
-
-def _warm_seconds(settings: GainFit, tolerance: float) -> float:
-    """Return the seconds of a Gauss-Newton solve of the paper's samples from the solution of the integration before."""
-    if not isinstance(settings, ForegroundFit) or settings.frozen:
-        return FROZEN_SECONDS
+        return FROZEN_COLD, FROZEN_SECONDS
     prior = settings.foreground_prior
-    if prior.finite:
-        if prior.estimated:
-            return ESTIMATED_SECONDS
-        widest = max(float(prior.deviation), float(prior.shared_deviation))
-        return FINITE_SECONDS * max(1.0, widest / FINITE_DEVIATION)
-    # No solve takes more than some hundred steps.
-    return FREE_SECONDS * max(1.0, (max(tolerance, 1e-6) / FREE_TOLERANCE) ** FREE_POWER)
+    if not prior.finite:
+        # No solve takes more than some hundred steps.
+        return FREE_COLD, FREE_SECONDS * max(1.0, (max(tolerance, 1e-6) / FREE_TOLERANCE) ** FREE_POWER)
+    if prior.estimated:
+        return FINITE_COLD, ESTIMATED_SECONDS
+    widest = max(float(prior.deviation), float(prior.shared_deviation))
+    return FINITE_COLD, FINITE_SECONDS * max(1.0, widest / FINITE_DEVIATION)

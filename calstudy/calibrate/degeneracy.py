@@ -42,8 +42,7 @@ def model_scale(gains: np.ndarray, model: np.ndarray, problem: CalibrationProble
     large, by the square of their relative rms. ``sky-model`` corrects that.
 
     Gains and model are as fitted, complex, (Nants, Nfreqs) and (Nbls, Nfreqs). Raises ValueError if no positive scale
-    exists: the summed model vanishes or opposes the summed sky model, or the data are not correlated with the sky
-    model.
+    exists: the summed model vanishes or opposes the summed sky model, or the data are not correlated with it.
     """
     if problem.prior == "none" or problem.frozen:
         return 1.0
@@ -74,12 +73,8 @@ def sky_model_slope(gains: np.ndarray, problem: CalibrationProblem) -> tuple[flo
     The slope is the scale of g_a g_b*, and the slopes of channels are its band shape, which all antennas share. A fit
     of free foregrounds does not determine the first, and the second only where it is not smooth.
 
-    Returns
-    -------
-    slope
-        sum w Re m* V / (g_a g_b*) over sum w |m|^2, with the sky model m; zero if that is zero where there are data.
-    shape
-        The same of each channel, over `slope`, (Nfreqs,); NaN in channels without data, and in all if `slope` is zero.
+    It is sum w Re m* V / (g_a g_b*) over sum w |m|^2, with the sky model m; zero if that is zero where there are data.
+    Slopes of channels are (Nfreqs,); NaN in channels without data, and in all if the slope is zero.
     """
     sky_model: Any = problem.sky_model
     calibrated = problem.visibilities / gain_products(gains, problem.structure.antennas)
@@ -114,13 +109,8 @@ def align(gains: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, float]:
     count them as errors. Near degeneracies between gains and smooth foregrounds are left as fitted. Both arrays are
     complex, (Nants, Nfreqs), and not changed.
 
-    Returns
-    -------
-    aligned
-        The gains, multiplied by one phase per channel and by `scale`, (Nants, Nfreqs).
-    scale
-        Real and positive. A model fitted with these gains must be divided by its square, so that the product of gains
-        and model, which is the fitted quantity, stays the same.
+    Return the gains, multiplied by one phase per channel and by a scale, and the scale, real and positive. A model
+    fitted with these gains must be divided by its square, so that gains times model, the fitted quantity, is the same.
     """
     turned = fix_phase(gains, reference)
     scale = float(np.vdot(turned, reference).real / np.vdot(turned, turned).real)

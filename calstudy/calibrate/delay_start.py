@@ -65,9 +65,8 @@ def delay_start(
     Autocorrelations and samples of weight zero, (Ntimes, Nbls, Nfreqs, Npols), have no influence. Without a sky model
     the gains have modulus one. They are one for antennas without data, and where there is nothing to fit.
 
-    Raises InputError if the channels do not lie on an even grid, or if the sky model is zero. Raises it without a sky
-    model as well, if gains in every channel are requested, or if channels are too wide for the delays of the
-    foregrounds.
+    Raises InputError if the channels do not lie on an even grid, the sky model is zero, or, without one, gains in every
+    channel are requested or channels are too wide for the delays of the foregrounds.
     """
     if settings.per_channel and sky is None:
         raise InputError(
@@ -143,8 +142,7 @@ class _DelayFit:
     def _window_scores(self, spectra: np.ndarray) -> np.ndarray:
         """Return the power fraction of v in a Gaussian about each delay, minus the mean, (Nbls, Ndelays), float32.
 
-        The convolution is a product with exp(-(2 pi k dnu sigma)^2 / 2) over the lags k of the autocorrelation in
-        frequency.
+        The convolution is a product with exp(-(2 pi k dnu sigma)^2 / 2) over the lags k of the autocorrelation.
         """
         scores = np.zeros((len(spectra), self.n_delays), np.float32)
         steps, width = np.arange(self.n_delays), self.grid.width

@@ -75,11 +75,8 @@ class Estimate(NamedTuple):
 def estimate(problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, seed: Sequence[int]) -> Estimate:
     """Make one step from the deviations of a problem towards the most likely ones, at its solution.
 
-    Parameters
-    ----------
-    problem : the fitted problem, whose foregrounds have a finite prior
-    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
-    seed : seed of the probes, other numbers for other solves
+    The foregrounds of the problem have a finite prior. The solution is complex, (Nants, Nfreqs) and (Nbls, Nfreqs).
+    `seed` is that of the probes, other numbers for other solves.
     """
     sequences = _Sequences(problem)
     widest = max(problem.deviations) * math.sqrt(problem.weights.max())

@@ -48,8 +48,7 @@ def smooth(
     """Smooth gains, (Nants, Nfreqs, Ntimes, Npols); flagged ones have no influence and stay as they are.
 
     Channels and integrations are those of `data`; `numbers` are those of the antennas, (Nants,). Raises InputError if
-    the reference antenna has no gains, if channels or integrations are not even where they must be, or if there are too
-    few integrations.
+    the reference antenna has no gains, or if channels or integrations are not even where they must be, or too few.
     """
     values = np.where(flags, 0, gains)
     if settings.reference_antenna is not None:
@@ -228,13 +227,10 @@ def _require_usable(sky_model: Observation, data: Observation) -> None:
         raise InputError("the sky model is not finite where the data are not flagged")
 
 
-def _name(calibrator: Calibrator) -> str:
-    file = FILE_REFERENCE.fullmatch(calibrator.reference)
-    return (calibrator.reference or type(calibrator).__name__) if file is None else Path(file["path"]).name
-
-
 def _where(calibrator: Calibrator) -> str:
-    return f"calibration.calibrator = {_name(calibrator)!r}"
+    file = FILE_REFERENCE.fullmatch(calibrator.reference)
+    name = Path(file["path"]).name if file is not None else calibrator.reference or type(calibrator).__name__
+    return f"calibration.calibrator = {name!r}"
 
 
 class _Returned:
@@ -246,7 +242,10 @@ class _Returned:
         self.calibrator, self.returned = calibrator, returned
         self._require(isinstance(returned, Calibration), f"returns {type(returned).__name__}, not a Calibration")
         self.groups = calibrator.solves(observation.n_times)
-        self.fitted = observation if returned.baselines is None else observation.baselines(self._chosen(observation))
+        self.fitted = observation
+        if returned.baselines is not None:
+            shape = (observation.n_baselines,)
+            self.fitted = observation.baselines(self._mask("baselines", returned.baselines, shape, least=1))
         self.numbers, self.gains, self.gain_flags = self._gains()
         self.closure = self._closure()
         self.model = self._model(assumed)
@@ -260,14 +259,15 @@ class _Returned:
         kind = ValueError if self.calibrator.is_built_in else InputError
         return kind(f"{_where(self.calibrator)}: {sentence}")
 
-    def _chosen(self, observation: Observation) -> np.ndarray:
-        chosen = np.asarray(self.returned.baselines)
+    def _mask(self, name: str, values: np.ndarray, shape: tuple[int, ...], least: int = 0) -> np.ndarray:
+        """Return a mask of the calibration, bool, which must have this shape and at least so many marks."""
+        mask = np.asarray(values)
         self._require(
-            chosen.dtype == bool and chosen.shape == (observation.n_baselines,) and bool(chosen.any()),
-            f"returns baselines of shape {chosen.shape} and type {chosen.dtype}, expected bool of shape "
-            f"({observation.n_baselines},) with at least one True",
+            mask.dtype == bool and mask.shape == shape and int(np.count_nonzero(mask)) >= least,
+            f"returns {name} of shape {mask.shape} and type {mask.dtype}, expected bool of shape {shape}"
+            + (" with at least one True" if least else ""),
         )
-        return chosen
+        return mask
 
     def _gains(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return antenna numbers, gains and their flags, (Nants, Nfreqs, Ntimes, Npols)."""
@@ -282,11 +282,7 @@ class _Returned:
             f"{shapes[0]} (antennas, channels, integrations, polarizations)"
             + (f" or {shapes[1]}, one for each solve" if shapes[0] != shapes[1] else ""),
         )
-        flags = np.zeros(gains.shape, bool) if flags is None else np.asarray(flags)
-        self._require(
-            flags.shape == gains.shape and flags.dtype == bool,
-            f"returns gain_flags of shape {flags.shape} and type {flags.dtype}, expected bool of shape {gains.shape}",
-        )
+        flags = np.zeros(gains.shape, bool) if flags is None else self._mask("gain_flags", flags, gains.shape)
         used = gains[~flags]
         self._require(
             bool(np.isfinite(used).all() and (used != 0).all()),
@@ -369,13 +365,7 @@ class _Returned:
         """
         flags = np.array(self.fitted.flags)
         if self.returned.flags is not None:
-            excluded = np.asarray(self.returned.flags)
-            self._require(
-                excluded.shape == flags.shape and excluded.dtype == bool,
-                f"returns flags of shape {excluded.shape} and type {excluded.dtype}, expected bool of shape "
-                f"{flags.shape}",
-            )
-            flags |= excluded
+            flags |= self._mask("flags", self.returned.flags, flags.shape)
         for index, outcome in enumerate(self.outcomes):
             if not outcome.usable:
                 p, group = divmod(index, len(self.groups))

@@ -81,14 +81,10 @@ class ExpectedTransfer:
 
     Attributes
     ----------
-    delay
-        Ascending, s, (Ndelays,).
-    transfer
-        T, (Nbls, Ndelays); NaN for baselines without data.
-    error
-        Standard deviation of the stochastic estimate, of the same shape; zero if it is exact.
-    foregrounds, gains
-        Fractions that foregrounds and gains absorb, of the same shape; the three fractions add up to one.
+    delay : ascending, s, (Ndelays,)
+    transfer : T, (Nbls, Ndelays); NaN for baselines without data
+    error : standard deviation of the stochastic estimate, of the same shape; zero if it is exact
+    foregrounds, gains : fractions that these absorb, of the same shape; the three fractions add up to one
     """
 
     delay: np.ndarray = field(metadata={"unit": "s"})
@@ -103,21 +99,9 @@ def expected_transfer(
 ) -> ExpectedTransfer:
     """Predict the fraction of a white signal that a fit preserves, for every baseline and delay.
 
-    Parameters
-    ----------
-    problem
-        The fitted problem.
-    gains, model
-        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    modes
-        The delay modes of its channels.
-    probes
-        Number of random vectors; None for the exact diagonal.
-
-    Raises
-    ------
-    ValueError
-        If the exact diagonal of a large problem is requested, or fewer than two probes.
+    The solution of the fitted problem is complex, (Nants, Nfreqs) and (Nbls, Nfreqs); `modes` are those of its
+    channels. `probes` is the number of random vectors, None for the exact diagonal. Raises ValueError if the latter is
+    requested for a large problem, or fewer than two probes.
     """
     tangent = TangentSpace.at(problem, gains, model)
     used = tangent.roots > 0
@@ -281,21 +265,10 @@ def linear_response(
 
     It is the difference of the residuals of two fits, of data with the signal and without, if both are at the minimum;
     it does not depend on where these start and stop. Single precision does not resolve it where foregrounds nearly
-    follow the gains.
+    follow the gains. It is complex, (Nbls, Nfreqs), and zero for samples without weight where foregrounds are fitted.
+    Where they are the sky model, the residual has these samples too.
 
-    Parameters
-    ----------
-    problem
-        The fitted problem.
-    gains, model
-        The solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex.
-    signal
-        Calibrated visibilities of the signal, (Nbls, Nfreqs), in the unit of the model.
-
-    Returns
-    -------
-    Complex, (Nbls, Nfreqs). It is zero for samples without weight where foregrounds are fitted. Where they are the sky
-    model, the residual has these samples too.
+    The solution is complex, (Nants, Nfreqs) and (Nbls, Nfreqs); the signal is like the model and in its unit.
     """
     tangent, response = TangentSpace.at(problem, gains, model), GainResponse(problem, gains, dtype=tf.float64)
     left = tangent.without_foregrounds(tangent.roots * signal)

@@ -22,7 +22,7 @@ import numpy as np
 from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
-from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile, known_gains, solution_times
+from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile, closest_solutions, known_gains, solution_times
 from calstudy.base.visibilities import polarization_names, positions
 from calstudy.calibrate.agreement import LIMITS, TAPER, aligned_gains
 from calstudy.calibrate.basis import ChannelGrid
@@ -147,8 +147,7 @@ def pair_gains(
     width = float(np.min(first.channel_width))
     if len(frequencies[0]) != len(frequencies[1]) or np.abs(np.subtract(*frequencies)).max() > SAME_CHANNEL * width:
         raise InputError("the two files do not have the same channels")
-    times = [solution_times(cal) for cal in (first, second)]
-    closest = np.abs(times[1][None] - times[0][:, None]).argmin(axis=1)
+    closest = closest_solutions(second, solution_times(first))
     values, known = zip(*(_gains(cal, numbers, feeds[polarization]) for cal in (first, second)), strict=True)
     used = known[0] & known[1][closest]
     combined = None

@@ -72,12 +72,9 @@ NoiseFrom = Literal["weights", "residual"]
 
 
 class Absorption(NamedTuple):
-    """What foregrounds absorb.
+    """What foregrounds absorb: a number of complex numbers in the data, `sequences`, and what it does to variances.
 
-    Attributes
-    ----------
-    variances : variances of gains over those with known foregrounds, (2, Nants, Nfreqs); of amplitudes, then phases
-    sequences : number of complex numbers in the data
+    `variances` are those of gains over those with known foregrounds, (2, Nants, Nfreqs); of amplitudes, then phases.
     """
 
     variances: np.ndarray
@@ -156,12 +153,8 @@ def gain_errors(
 ) -> GainErrors | str:
     """Compute the errors of gains by noise, or say in a sentence why there are none.
 
-    Parameters
-    ----------
-    problem : the fitted problem, with the weights of its last pass
-    gains, model : the solution, (Nants, Nfreqs) and (Nbls, Nfreqs), complex
-    frequencies : channel centres, Hz, (Nfreqs,)
-    absorbed : what foregrounds absorb, as of a similar problem; by default it is computed
+    The fitted problem has the weights of its last pass; its solution is complex, (Nants, Nfreqs) and (Nbls, Nfreqs).
+    Frequencies are channel centres, Hz, (Nfreqs,). `absorbed` is that of a similar problem; by default it is computed.
     """
     structure = problem.structure
     if structure.gain_vectors is not None:
@@ -217,10 +210,8 @@ def _signal_to_noise(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the signal to noise of each antenna, and what noise alone makes of it, (Nants,); NaN without data.
 
-    Parameters
-    ----------
-    fitted, residual : g_a g_b* F, and what is left of the data, (Nbls, Nfreqs)
-    sequences : number of complex numbers in the data that free foregrounds follow
+    `fitted` and `residual` are g_a g_b* F and what is left of the data, (Nbls, Nfreqs); `sequences` is the number of
+    complex numbers in the data that free foregrounds follow.
     """
     used, found = problem.weights > 0, np.full((2, problem.structure.n_antennas), np.nan)
     for antenna in range(problem.structure.n_antennas):
@@ -248,10 +239,7 @@ class _Last(NamedTuple):
 class ErrorsInTime:
     """Errors of solves of one polarization, in the order of time; see `gain_errors`.
 
-    Parameters
-    ----------
-    frequencies : channel centres, Hz, (Nfreqs,)
-    longest : longest baseline, m
+    Frequencies are channel centres, Hz, (Nfreqs,), and `longest` is the longest baseline, m.
     """
 
     def __init__(self, frequencies: np.ndarray, longest: float) -> None:

@@ -36,10 +36,7 @@ if TYPE_CHECKING:
 class GainRealizations:
     """Data that are calibrated, what a calibrator takes from them, and the result.
 
-    Attributes
-    ----------
-    sky, noise : as for `run_calibrator`
-    count : number of realizations, 2 or more
+    Sky and noise are as for `run_calibrator`; `count` is the number of realizations, 2 or more.
     """
 
     calibrator: Calibrator

@@ -38,8 +38,7 @@ class Assumed:
     sky_model
         Visibilities of the known part of the sky, with the baselines, times, channels and polarizations of the data,
         in the same order; None if there are none.
-    gains
-        Gains to start from, None for unity. A calibrator that does not iterate may ignore them.
+    gains : gains to start from, None for unity. A calibrator that does not iterate may ignore them.
     noise
         Standard deviation of the complex noise of a sample that was measured once (nsamples of one), in the unit of
         the data; None if it is not known. Requested by `Calibrator.needs_noise`.
@@ -71,12 +70,9 @@ class Calibration:
     gain_flags
         Mask of gains that must not be used, bool, like `gains`; None for none, or for those of the UVCal. Gains of
         antennas without data in a channel of an integration are flagged anyhow.
-    model
-        The foregrounds F, (Ntimes, Nbls, Nfreqs, Npols), in the unit of the data; None for the sky model.
-    flags
-        Samples that are excluded besides the flagged ones, like `model`; None for none.
-    baselines
-        Mask of the calibrated baselines, bool, (Nbls,); None for all. Model and flags cover only these.
+    model : the foregrounds F, (Ntimes, Nbls, Nfreqs, Npols), in the unit of the data; None for the sky model
+    flags : samples that are excluded besides the flagged ones, like `model`; None for none
+    baselines : mask of the calibrated baselines, bool, (Nbls,); None for all. Model and flags cover only these.
     closure
         Factors c of baselines that are no product of gains, V = c_ab g_a g_b* F, real or complex, like `model`; None:
         all are 1. They are for simulated data.
@@ -93,16 +89,10 @@ class Calibration:
 
 @dataclass(frozen=True)
 class SolvePlan:
-    """Properties of a calibration that are known before it starts.
+    """Properties of a calibration that are known before it starts: the cost of all its solves, details and notes.
 
-    Attributes
-    ----------
-    cost
-        Cost of all its solves.
-    details
-        Details worth reporting besides the dimensions of the data, such as "640 foreground coefficients each".
-    notes
-        Sentences on settings that will not work well.
+    Details are worth reporting besides the dimensions of the data, such as "640 foreground coefficients each". Notes
+    are sentences on settings that will not work well.
     """
 
     cost: Cost
@@ -201,15 +191,9 @@ class Calibrator(Plugin):
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return in one sentence why data cannot be calibrated, or None if they can.
 
-        Plans call this before there are data, and it is called again before data are calibrated. A sentence about a
-        setting starts with its path and a colon, such as ``basis.buffer: must be ...``.
-
-        Parameters
-        ----------
-        frame
-            Antennas, baselines and channels of the data.
-        has_sky_model
-            Whether `Assumed.sky_model` will be given.
+        Plans call this before there are data, and it is called again before data are calibrated. `has_sky_model` says
+        whether `Assumed.sky_model` will be given. A sentence about a setting starts with its path and a colon, such as
+        ``basis.buffer: must be ...``.
         """
         del frame, has_sky_model
         return None
@@ -240,27 +224,15 @@ class Calibrator(Plugin):
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Calibrate a whole number of groups of `integrations_per_solve` integrations; the last may be shorter.
 
-        Parameters
-        ----------
-        observation
-            The data; arrays are read-only.
-        assumed
-            Information that may be taken as given.
-        progress
-            Call this after each solve with the number done and the total; None for no progress reports.
+        Arrays of the data are read-only; `assumed` may be taken as given. `progress`, if there is one, is called after
+        each solve with the number done and the total.
         """
 
     def for_data(self, digest: str, sky_model: str | None = None) -> Self:
         """Return the calibrator of one data set of a run; by default the same for all data sets.
 
-        Plans call this. A calibrator that reads files for each data set overrides it, and may raise InputError.
-
-        Parameters
-        ----------
-        digest
-            Digest of all inputs of the data set.
-        sky_model
-            Digest of all inputs of the sky model; None if there is none.
+        Plans call this, with digests of all inputs of the data set and of the sky model, None if there is none. A
+        calibrator that reads files for each data set overrides it, and may raise InputError.
         """
         del digest, sky_model
         return self

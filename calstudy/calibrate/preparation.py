@@ -148,28 +148,26 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
         one = prepared.structure_between(int(with_data[0]), int(with_data[-1]) + 1, settings)
     except InputError as error:
         return f"between flagged edges of the band: {error}"
-    structure = repeat_structure(one, times.stop - times.start)
+    n_times = times.stop - times.start
+    structure = repeat_structure(one, n_times)
     if not np.any(visibilities, where=weights > 0):
         return "the data are zero"
     sky = None if prepared.sky is None else rows(prepared.sky)
     deviations = _deviations(sky, weights, settings)
     if deviations == (0, 0):
         return "the sky model is zero, and the deviations of the foregrounds' prior are fractions of it"
+    # The start is that of the integration with the most data.
+    fullest = times.start + np.argmax(np.count_nonzero(weights.reshape(n_times, -1), axis=1))
     return CalibrationProblem(
         structure,
         visibilities,
         weights,
-        prepared.start[:, :, times.start + _fullest(weights, times.stop - times.start), polarization],
+        prepared.start[:, :, fullest, polarization],
         sky,
         settings.prior if isinstance(settings, ForegroundFit) else "sum",
         frozen=settings.frozen,
         deviations=deviations,
     )
-
-
-def _fullest(weights: np.ndarray, n_times: int) -> int:
-    """Return the first of the integrations that are solved together, (Ntimes Nbls, Nfreqs), with the most data."""
-    return int(np.argmax(np.count_nonzero(weights.reshape(n_times, -1), axis=1)))
 
 
 def _deviations(sky: np.ndarray | None, weights: np.ndarray, settings: GainFit) -> tuple[float, float]:
@@ -220,11 +218,7 @@ def starting_gains(data: Observation, gains: UVCal | None) -> np.ndarray:
 
 
 def redundant_start(
-    data: Observation,
-    weights: np.ndarray,
-    settings: RedundantStart,
-    tolerance: float,
-    sky: np.ndarray | None = None,
+    data: Observation, weights: np.ndarray, settings: RedundantStart, tolerance: float, sky: np.ndarray | None = None
 ) -> np.ndarray:
     """Solve redundant baselines for gains to start from, complex128, shape (Nants, Nfreqs, Ntimes, Npols).
 
@@ -298,9 +292,7 @@ def _solve(
 
 
 def _along_sky(
-    reds: list[list[Key]],
-    overlap: dict[Key, np.ndarray],
-    gains: dict[int, np.ndarray],
+    reds: list[list[Key]], overlap: dict[Key, np.ndarray], gains: dict[int, np.ndarray]
 ) -> dict[int, np.ndarray]:
     """Return gains with the phase gradient of the sky model; `overlap` are weighted data times its conjugate."""
     from hera_cal.abscal import complex_phase_abscal

@@ -281,8 +281,7 @@ def weight_change(weights: np.ndarray, before: np.ndarray) -> float:
     """Return the relative rms change of weights in neighbouring channels against each other.
 
     Smooth changes in frequency are ignored: they carry no error of the foregrounds to other delays, and persist while a
-    fit moves along gains that foregrounds can nearly follow. Weights are (..., Nfreqs); samples of zero weight are left
-    out.
+    fit moves along gains that foregrounds can nearly follow. Weights are (..., Nfreqs); zeros are left out.
     """
     used = (before > 0) & (weights > 0)
     ratio = np.divide(weights, before, out=np.ones_like(weights), where=used)

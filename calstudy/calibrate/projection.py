@@ -375,10 +375,7 @@ class Projector:
         return self._pulled(self._products.change(eta, ends, curvature, second), stretch, part)
 
     def _over_stretches(
-        self,
-        function: Callable[[tf.Tensor, Stretch, Linearization], tf.Tensor],
-        eta: tf.Tensor,
-        projection: Projection,
+        self, function: Callable[[tf.Tensor, Stretch, Linearization], tf.Tensor], eta: tf.Tensor, projection: Projection
     ) -> tf.Tensor:
         """Sum a function over the stretches, one after the other."""
         sums: list[tf.Tensor] = []

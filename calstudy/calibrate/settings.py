@@ -78,10 +78,7 @@ class AdamaxSettings(Section):
     warm_start: bool = False
 
 
-Solver = Annotated[
-    GaussNewtonSettings | AdamaxSettings,
-    choice("name", "gauss-newton"),
-]
+Solver = Annotated[GaussNewtonSettings | AdamaxSettings, choice("name", "gauss-newton")]
 
 
 UNSETTLED = 10.0
@@ -155,10 +152,7 @@ class FileWeights(Section):
     path: Path = Field(strict=False)
 
 
-Weights = Annotated[
-    GainWeights | FlagWeights | SampleWeights | AutoWeights | FileWeights,
-    choice("kind", "gains"),
-]
+Weights = Annotated[GainWeights | FlagWeights | SampleWeights | AutoWeights | FileWeights, choice("kind", "gains")]
 
 
 class BaselineRange(Section):

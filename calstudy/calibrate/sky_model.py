@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def read_sky_model(path: Path, template: UVData) -> UVData:
-    """Read visibilities, in Jy, at the samples of an observation.
+    """Read visibilities, in Jy, and return them with the metadata of an observation, at its samples.
 
     Raises InputError if the file cannot be read or takes data from other files, lacks baselines, integrations, channels
     or polarizations of the observation, or has flagged samples or values that are not finite among them.
@@ -27,11 +27,6 @@ def read_sky_model(path: Path, template: UVData) -> UVData:
         A file in any format of visibilities that pyuvdata reads, in Jy. Antennas are matched by number; their positions
         may differ from those of the template.
     template : metadata of the observation: rectangular, time-major, a drift scan
-
-    Returns
-    -------
-    UVData
-        The template's metadata with the visibilities of the file.
     """
     from pyuvdata import UVData
 

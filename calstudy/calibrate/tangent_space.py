@@ -18,12 +18,9 @@ SPAN_CUTOFF = 1e-6
 class Response:
     """The part of a whitened change y that foregrounds of some baselines absorb: own own^T y + common common^T y.
 
-    Attributes
-    ----------
-    members : indices of the baselines
-    common
-        Sequences on all of them together, (Nmembers, Nfreqs, Nvec), real; orthonormal unless there is a finite prior.
-    own : sequences of each baseline by itself, of the same kind; None if there are none
+    `members` are indices of the baselines. Common sequences on all of them together are real, (Nmembers, Nfreqs, Nvec),
+    and orthonormal unless there is a finite prior; those of each baseline by itself are of the same kind, None if there
+    are none.
     """
 
     members: np.ndarray
@@ -46,13 +43,10 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class TangentSpace:
-    """The tangent space of a fit, in units in which the noise of the likelihood is white.
+    """The tangent space of a fitted problem, in units in which the noise of the likelihood is white.
 
-    Attributes
-    ----------
-    problem : the fitted problem
-    roots : square root of D, (Nbls, Nfreqs)
-    slope : sqrt(D) F, the derivative of a baseline in a relative change of a gain, (Nbls, Nfreqs), complex
+    `roots` is the square root of D, (Nbls, Nfreqs), and `slope` is sqrt(D) F, the derivative of a baseline in a
+    relative change of a gain, (Nbls, Nfreqs), complex.
     """
 
     problem: CalibrationProblem

@@ -22,8 +22,7 @@ from calstudy.calibrate.problem import CalibrationProblem, FitStructure
 class SortedData(NamedTuple):
     """The data of one problem, in the solvers' order and orientation.
 
-    Visibilities, (2, Nbls, Nfreqs), are divided by their weighted rms, `scale`; weights, (Nbls, Nfreqs), are as in the
-    problem.
+    Visibilities, (2, Nbls, Nfreqs), are divided by their weighted rms, `scale`; weights are those of the problem.
     """
 
     visibilities: tf.Tensor
@@ -227,8 +226,7 @@ class BaselineProducts:
 class GainSpace:
     """Coordinates of the gains: pairs (2, Nants, Nfreqs) themselves, or coefficients (2, Nants, Ngain) of a basis.
 
-    Solvers iterate on relative changes eta of the gains, g (1 + eta). A basis B is a change of coordinates, eta =
-    (c B^T) / g.
+    Solvers iterate on relative changes eta of the gains, g (1 + eta). A basis B changes coordinates, eta = (c B^T) / g.
 
     The basis is orthonormal, (Nfreqs, Ngain), as from `calstudy.calibrate.basis.gain_vectors`, or None for no
     restriction. `dtype` is that of all tensors.

@@ -141,8 +141,7 @@ class _Drift(Section, ABC):
     def unit_process(self, shape: tuple[int, ...], seconds: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return independent processes of unit amplitude, float64, (*shape, Ntimes).
 
-        `shape` is (2, Nants, Nfreqs or Ncomponents or 1, Npols); `seconds`, (Ntimes,), is the time since the first
-        integration.
+        `shape` is (2, Nants, Nfreqs or Ncomponents or 1, Npols); `seconds`, (Ntimes,), are since the first.
         """
 
 

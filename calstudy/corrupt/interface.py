@@ -26,17 +26,9 @@ Truth = Mapping[str, np.ndarray]
 class Effect(Plugin, ABC):
     """An effect on the data between the sky and the calibration.
 
-    Fields of a subclass are its settings. One that draws random numbers declares ``seed: int``.
-
-    Attributes
-    ----------
-    uses_positions
-        True if anything depends on the positions of antennas. The observation then has the positions as built.
-
-    Notes
-    -----
-    The `Observation` that `draw` and `apply` receive has no data: only antennas, baselines, channels, times and
-    polarizations.
+    Fields of a subclass are its settings. One that draws random numbers declares ``seed: int``. The `Observation` that
+    `draw` and `apply` receive has no data: only antennas, baselines, channels, times and polarizations.
+    `uses_positions` is true if anything depends on the positions of antennas, which then are those as built.
     """
 
     registry: ClassVar[Registry[Effect]] = Registry(
@@ -73,14 +65,8 @@ class Effect(Plugin, ABC):
     def apply(self, visibilities: np.ndarray, observation: Observation, truth: Truth) -> np.ndarray:
         """Return the visibilities after the effect, complex, of the same shape; by default unchanged.
 
-        Parameters
-        ----------
-        visibilities
-            Before the effect, complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols). May be changed in place.
-        observation
-            See the notes of the class.
-        truth
-            From `draw`.
+        Those before the effect are complex128 in Jy, (Ntimes, Nbls, Nfreqs, Npols), and may be changed in place. The
+        truth is from `draw`.
         """
         del observation, truth
         return visibilities

@@ -74,8 +74,7 @@ def set_levels(
     are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
 
     The rms of the simulated visibilities and the standard deviation of radiometer noise, (Nfreqs, Npols)
-    (`radiometer_std`), are in Jy. Raise InputError if a component that must be scaled, or scaled
-    to, is zero.
+    (`radiometer_std`), are in Jy. Raise InputError if a component is zero that must be scaled, or scaled to.
     """
     if eor_rms <= 0:
         raise InputError("sky.eor: its visibilities are all zero")

@@ -29,8 +29,7 @@ class SystemTemperature(Section):
     def autocorrelations(self, frequencies: np.ndarray, effective_area: float | np.ndarray) -> np.ndarray:
         """Return V_aa = k T / A_e in Jy, (Nfreqs,), in the convention V_xx = 1/2 int A I of the simulation.
 
-        Frequencies are channel centres, Hz, (Nfreqs,); the effective area of an antenna is in m2, a number or
-        (Nfreqs,).
+        Frequencies are channel centres, Hz, (Nfreqs,); the effective area is in m2, a number or (Nfreqs,).
         """
         kelvin = self.receiver + self.sky * (frequencies / self.sky_frequency) ** self.sky_index
         return BOLTZMANN * kelvin / effective_area / WATTS_PER_JANSKY
@@ -119,8 +118,7 @@ class NoNoise(Section):
 
 
 Noise = Annotated[
-    NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise,
-    choice("kind", "times-eor"),
+    NoiseRelativeToEor | NoiseRelativeToForegrounds | RadiometerNoise | NoNoise, choice("kind", "times-eor")
 ]
 
 

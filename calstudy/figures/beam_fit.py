@@ -176,7 +176,7 @@ def compare_floors(
     times = integration_times(whole)
     template = subset_template(whole, times[len(times) // 2 :][:1], whole.freq_array)
     sources = make_foregrounds(sky.foregrounds, whole.freq_array, sky.diffuse).sky
-    accuracy = simulation.nodes.for_foregrounds(smooth_beam=False, smooth_sky=False)
+    accuracy = simulation.nodes.accuracy(eor=False, smooth_beam=False, smooth_sky=False)
     floors = {}
     for name in INTERPOLATIONS:
         beam = interpolated(instrument.beam, instrument.channels, name)

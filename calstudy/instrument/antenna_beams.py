@@ -149,8 +149,7 @@ class AntennaFrame:
     """Directions (Ndirections,) in the frame of a misaligned antenna.
 
     All angles are in rad; azimuths run from east through north. `nominal_zenith_angle` is the one at which the nominal
-    beam has the value of this one. It is at most pi / 2: directions below the antenna's own horizon have the value
-    there.
+    beam has the value of this one. It is at most pi / 2: below the antenna's own horizon the beam has the value there.
     """
 
     def __init__(self, misalignment: Misalignment, azimuth: np.ndarray, zenith_angle: np.ndarray) -> None:

@@ -34,8 +34,7 @@ def read_beamfits(path: Path) -> UVBeam:
     """Read a beam from a beamfits file, as an E-field on a grid of azimuth and zenith angle from the zenith.
 
     The phases of a power beam are lost: its field is the square root of the power, along the direction of the feed.
-    Raises InputError if the file is missing, cannot be read, has feeds other than x and y, or lacks a part of the sky
-    above the horizon.
+    Raises InputError if the file is missing, cannot be read, has feeds other than x and y, or lacks a part of the sky.
     """
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
@@ -143,8 +142,7 @@ class HealpixRings:
     The pixels of a ring are equally spaced, and give its Fourier coefficients in azimuth up to the order that their
     number allows. Splines in zenith angle join those of all rings, order by order. They continue beyond the zenith,
     where a coefficient of order m returns with the sign (-1)^m, and at which all but that of order 0 vanish. The
-    azimuth, from east through north, is the longitude of the beam. Raises InputError if a pixel above the horizon is
-    missing.
+    azimuth, from east through north, is the longitude. Raises InputError if a pixel above the horizon is missing.
     """
 
     def __init__(self, beam: UVBeam, path: Path) -> None:

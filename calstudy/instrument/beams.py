@@ -100,12 +100,8 @@ class ExactBeam:
 class GriddedBeam:
     """A beam tabulated on a grid of directions and frequencies (`Beam`).
 
-    Attributes
-    ----------
-    fit_error
-        Largest difference of a Jones component from the tabulated one within the band, relative to the zenith
-        (`TabulatedBeam`).
-    tabulated_frequencies : frequencies of the table in and next to the band, in Hz, (Ntab,)
+    `fit_error` is the largest difference of a Jones component from the tabulated one within the band, relative to the
+    zenith (`TabulatedBeam`). `tabulated_frequencies` are those of the table in and next to the band, in Hz, (Ntab,).
     """
 
     def __init__(self, table: TabulatedBeam | Tile, name: str, stand_in: str | None) -> None:

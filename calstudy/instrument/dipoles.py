@@ -74,8 +74,7 @@ dipole_fields = lru_cache(maxsize=1)(DipoleFields)
 def _single_fields(path: Path, low: float, high: float) -> Iterator[np.ndarray]:
     """Yield J of each dipole, (Ntab, 2 [azimuth, zenith angle], 2 [x, y], Nza, Naz), complex.
 
-    These are the steps of `UVBeam.read_mwa_beam`, which would read the modes of all dipoles and frequencies each time
-    and take six times as long.
+    These are the steps of `UVBeam.read_mwa_beam`, which would read all modes each time and take six times as long.
     """
     reader = MWABeam()
     available, feeds, dipoles, lengths = reader._read_metadata(path)

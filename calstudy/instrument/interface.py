@@ -22,10 +22,7 @@ STAND_IN = "beam: {what}, not the MWA full embedded element of Sokolowski et al.
 class AntennaBeam(Protocol):
     """The primary beam of an antenna, as simulations need it.
 
-    Attributes
-    ----------
-    stand_in
-        A note if it is not the beam of the paper, otherwise None.
+    `stand_in` is a note if it is not the beam of the paper, otherwise None.
     """
 
     name: str
@@ -58,8 +55,8 @@ class AntennaBeams:
     @property
     def stand_in(self) -> str | None:
         """The note on the beam of `instrument.beam`, and the number of antennas with other beams."""
-        others = f"antennas with another: {int((self.index > 0).sum())}"
-        return "; ".join(note for note in (self.beams[0].stand_in or f"beam: {self.beams[0].name}", others))
+        first = self.beams[0].stand_in or f"beam: {self.beams[0].name}"
+        return f"{first}; antennas with another: {int((self.index > 0).sum())}"
 
 
 def model_of(section: Plugin) -> BeamModel:
@@ -70,12 +67,8 @@ def model_of(section: Plugin) -> BeamModel:
 class BeamModel(Plugin, ABC):
     """The settings of a beam, from which the beam is made. Fields of a subclass are its settings.
 
-    Its module is imported when an experiment file is read: import slow libraries inside `make`.
-
-    Attributes
-    ----------
-    dipoles
-        Number of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
+    Its module is imported when an experiment file is read: import slow libraries inside `make`. `dipoles` is the number
+    of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
     """
 
     registry: ClassVar = BEAMS
@@ -91,17 +84,7 @@ class BeamModel(Plugin, ABC):
     def make_tiles(self, channels: Channels, amplitudes: np.ndarray) -> list[Beam]:
         """Return the beams of tiles with given amplitudes of their dipoles; only if `dipoles` is not zero.
 
-        Parameters
-        ----------
-        channels
-            As for `make`.
-        amplitudes
-            (Ntiles, 2 [x, y], dipoles), one where nominal and zero where dead.
-
-        Raises
-        ------
-        InputError
-            As for `make`.
+        Amplitudes are (Ntiles, 2 [x, y], dipoles), one where nominal and zero where dead. Raises InputError as `make`.
         """
         raise NotImplementedError(f"the beam {self.label} has no dipoles")
 
@@ -114,15 +97,7 @@ class BeamModel(Plugin, ABC):
 
     @abstractmethod
     def make(self, channels: Channels) -> Beam:
-        """Return the beam.
+        """Return the beam for the channels of an observation; it need not be known far outside their band.
 
-        Parameters
-        ----------
-        channels
-            Channels of the observation. The beam need not be known far outside their band.
-
-        Raises
-        ------
-        InputError
-            If a beam file is missing, cannot be read, or does not cover the channels.
+        Raises InputError if a beam file is missing, cannot be read, or does not cover the channels.
         """

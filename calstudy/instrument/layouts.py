@@ -106,12 +106,8 @@ class Layout:
 class ArrayLayout(Plugin, ABC):
     """The settings of a layout, from which positions are made. Fields of a subclass are its settings.
 
-    Attributes
-    ----------
-    site
-        Name of the site of the array unless `instrument.location` gives another; None if it must.
-    regular
-        Whether antennas are on a flat lattice, which fast simulations use.
+    `site` is the name of the site of the array unless `instrument.location` gives another; None if it must. `regular`
+    is whether antennas are on a flat lattice, which fast simulations use.
     """
 
     registry: ClassVar = LAYOUTS
@@ -127,23 +123,12 @@ class ArrayLayout(Plugin, ABC):
 
     @abstractmethod
     def make(self) -> Layout:
-        """Return the antennas.
-
-        Raises
-        ------
-        InputError
-            If an input file is missing or does not hold positions.
-        """
+        """Return the antennas; raises InputError if an input file is missing or does not hold positions."""
 
     def flat(self, positions: np.ndarray, prefix: str | None = None) -> Layout:
-        """Return a flat array about the mean of positions, with antennas numbered and named from 0.
+        """Return a flat array about the mean of positions, east and north in m, (Nants, 2).
 
-        Parameters
-        ----------
-        positions
-            East and north, (Nants, 2), m.
-        prefix
-            Of the antennas' names; the label of the layout if None.
+        Antennas are numbered from 0. Their names are a prefix, by default the label of the layout, and the number.
         """
         enu = np.column_stack([positions - positions.mean(axis=0), np.zeros(len(positions))])
         numbers = np.arange(len(enu))

@@ -35,9 +35,8 @@ def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpola
     """Make the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
 
     Reading the file and fitting its table is slow, so the fit is kept for later processes. The default file is that of
-    `calstudy.base.package_files.BEAM`. `band` is the lowest and highest frequency in Hz; the margin that a fit
-    needs is read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file is missing or is not
-    an MWA beam file of this band.
+    `calstudy.base.package_files.BEAM`. `band` is the lowest and highest frequency in Hz; the margin that a fit needs is
+    read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file is missing or not of this band.
     """
     path = BEAM.find() if path is None else path
     if not path.is_file():
@@ -70,8 +69,7 @@ def _read_mwa(path: Path, band: tuple[float, float]) -> UVBeam:
 def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> dict[str, Any]:
     """Reduce a table on a grid of azimuth and zenith angle to the arrays, strings and numbers of a `TabulatedBeam`.
 
-    They can be stored in a file. `band` is the lowest and highest frequency in Hz. Raises InputError if the table does
-    not cover the band.
+    They can be stored in a file. `band` is in Hz. Raises InputError if the table does not cover it.
     """
     chosen = choose_frequencies(table.freq_array, band, interpolation)
     tabulated = table.freq_array[chosen]
@@ -103,10 +101,8 @@ class TabulatedBeam:
 
     Attributes
     ----------
-    zenith_angles : (Nza,) float
-        In radians.
-    tabulated_frequencies : (Ntab,) float
-        Those in the band, and those next to its ends, in Hz.
+    zenith_angles : in rad, (Nza,)
+    tabulated_frequencies : those in the band, and those next to its ends, in Hz, (Ntab,)
     fit_error : largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`
     """
 

@@ -56,8 +56,7 @@ def divide(times_jd: np.ndarray, integration: float, count: int, span: Sequence[
     """Divide a run into `count` blocks of the same duration and return those that have integrations.
 
     `times_jd` are Julian dates, ascending, (n,), and `integration` is the duration of one, s. `span` is the first and
-    the last integration of the run if not those of `times_jd`, for data sets whose blocks must share their phase
-    centres.
+    the last integration of the run if not those of `times_jd`, for data sets that must share phase centres.
     """
     first, last = span or (times_jd[0], times_jd[-1])
     half = integration / SECONDS_PER_DAY / 2

@@ -31,14 +31,7 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import (
-    CylindricalSpectrum,
-    DelaySpectra,
-    SphericalSpectrum,
-    bins_of_k,
-    length_bins,
-    outside_wedge,
-)
+from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, bins_of_k, length_bins
 
 NEGLIGIBLE = 1e-3
 """Correlations of powers below this are taken as zero."""
@@ -182,12 +175,8 @@ def modes_in_bins(
     spectra: DelaySpectra, settings: PowerSettings, exclude_wedge: bool, only_wedge: bool = False
 ) -> np.ndarray:
     """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those left out; parameters as in `spherical_average`."""
-    bins = bins_of_k(spectra, make_bin_edges(settings.bins))
-    if exclude_wedge:
-        bins[~outside_wedge(spectra, settings.wedge_buffer)] = -1
-    if only_wedge:
-        bins[outside_wedge(spectra, settings.wedge_buffer)] = -1
-    return bins
+    buffer = settings.wedge_buffer if exclude_wedge or only_wedge else None
+    return bins_of_k(spectra, make_bin_edges(settings.bins), buffer, inside=only_wedge)
 
 
 def spherical_average(

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calstudy.power.spectra import DelaySpectra, bins_of_k, outside_wedge
+from calstudy.power.spectra import DelaySpectra, bins_of_k
 
 LARGEST_PART = 0.5
 """Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""
@@ -144,8 +144,7 @@ class Sums:
 def linear_error(terms: tuple[tuple[np.ndarray, Sums], ...]) -> np.ndarray:
     """Return the standard deviation of a linear combination of totals whose deviations add up to zero in each bin.
 
-    `terms` are factors, (n_bins,), and the sums that they multiply. The error, (n_bins,), is NaN in bins of one sample,
-    whose scatter is not known.
+    `terms` are factors, (n_bins,), and the sums that they multiply. The error, (n_bins,), is NaN in bins of one sample.
     """
     clusters = terms[0][1].clusters
     share_owner = clusters.owner[clusters.share_sample]
@@ -191,7 +190,6 @@ def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, insid
 
     `edges` are as in `calstudy.power.spectra.bins_of_k`. Modes with |tau| <= |b|/c + `buffer` (s) are inside the wedge.
     """
-    bins = bins_of_k(spectra, edges)
-    bins[outside_wedge(spectra, buffer) == inside] = -1
+    bins = bins_of_k(spectra, edges, buffer, inside)
     samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
     return Clusters.of(spectra, bins, samples, edges.size - 1)

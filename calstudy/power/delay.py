@@ -10,12 +10,7 @@ from calstudy.base.constants import SPEED_OF_LIGHT
 
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
-TAPERS = {
-    "blackman-harris": "blackmanharris",
-    "hann": "hann",
-    "tukey": "tukey",
-    "none": "boxcar",
-}
+TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "boxcar"}
 """The tapers of `calstudy.power.settings.PowerSettings`, and their names in scipy.signal.windows."""
 
 
@@ -42,17 +37,9 @@ def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: st
     """Transform visibilities from frequency to delay.
 
     V~(tau) = dnu sum_nu exp(2 pi i tau nu) V(nu) T(nu) (paper, third equation of §Reduction of Simulation Products).
-    Raises ValueError if the frequencies do not match the last axis or are not equally spaced, or the taper is unknown.
-
-    Parameters
-    ----------
-    visibilities : complex, any shape with frequency along the last axis, in Jy
-    frequencies : equally spaced ascending channel centres in Hz, shape (Nfreqs,)
-    taper : name of the taper, see `TAPERS`
-
-    Returns
-    -------
-    Complex array of the same shape in Jy Hz, with delay in the order of `delays` along the last axis.
+    Visibilities in Jy have frequency along the last axis, the complex result in Jy Hz has delay in the order of
+    `delays`. Frequencies are equally spaced ascending channel centres in Hz, (Nfreqs,). Raises ValueError if they do
+    not match the last axis or are not equally spaced, or the taper is not in `TAPERS`.
     """
     visibilities = np.asarray(visibilities)
     n_channels = frequencies.size

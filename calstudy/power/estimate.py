@@ -58,8 +58,7 @@ class DiagonalPSpecData(PSpecData):
     def parse_blkey(self, key: tuple) -> tuple[int, tuple]:
         """Return the index of the data set and the baseline, with its polarization as an integer.
 
-        pyuvdata looks up the feeds of the telescope for each baseline whose polarization is text, which takes longer
-        than the spectrum.
+        For polarizations as text pyuvdata looks up the feeds of the telescope, which takes longer than the spectrum.
         """
         dset, (first, second, *polarization) = super().parse_blkey(key)
         numbers = [utils.polstr2num(pol) if isinstance(pol, str) else pol for pol in polarization]

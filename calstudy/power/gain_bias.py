@@ -36,12 +36,8 @@ if TYPE_CHECKING:
 class ErrorCovariance:
     """Second moments of errors of gains, over the variance of their real part.
 
-    Attributes
-    ----------
-    channels
-        C at separations of 0, 1, ... N - 1 channels, (N,); N is the number of channels, as of delays.
-    times : R between the integrations of a block, (n, n)
-    common : c, from 0 to 1
+    `channels` is C at separations of 0, 1, ... N - 1 channels, (N,), for as many channels as delays; `times` is R
+    between the integrations of a block, (n, n), and `common` is c, from 0 to 1.
     """
 
     channels: np.ndarray

@@ -50,8 +50,7 @@ class Estimator(Plugin, ABC):
             One integration each (`calstudy.power.average`), same baselines, channels and polarizations, in Jy with
             V_xx = 1/2 int A I. They share the sky but not the noise, and must not be changed. `odd` is `even` where the
             power of one data set is computed.
-        beam
-            Of the array.
+        beam : of the array
         settings
             The `power` section: taper, pairs, redundancy tolerance, cosmology. Bins, `wedge_buffer` and `length_bin`
             have their defaults: they apply later, when spectra are averaged.
@@ -85,11 +84,8 @@ def estimate_spectra(
     The estimator may write files into `folder`, or nowhere if it is None; with several integrations each has its own
     folder, `block-1` and so on.
 
-    Raises
-    ------
-    InputError
-        If the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, if even and odd
-        data have different numbers of integrations, or if no integration or no baseline is left.
+    Raises InputError if the estimator refuses, fails, or returns anything but consistent, finite `DelaySpectra`, if
+    even and odd data have different numbers of integrations, or if no integration or no baseline is left.
     """
     estimator = cast(Estimator, settings.estimator)
     found = []
@@ -172,12 +168,7 @@ def _fault(found: object) -> str | None:
     if not isinstance(found, DelaySpectra):
         return f"returned a {type(found).__name__}, expected DelaySpectra"
     units, n_delays = len(found.n_pairs), len(found.delay)
-    expected = {
-        "power": (units, n_delays),
-        "vectors": (units, 3),
-        "k_perp": (units,),
-        "k_parallel": (n_delays,),
-    }
+    expected = {"power": (units, n_delays), "vectors": (units, 3), "k_perp": (units,), "k_parallel": (n_delays,)}
     for name, shape in expected.items():
         values = getattr(found, name)
         if values.shape != shape:

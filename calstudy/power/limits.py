@@ -20,14 +20,9 @@ WITHIN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """The upper limits of a publication at one redshift, in ascending k.
+    """The upper limits of a publication at one redshift, that of the middle of their band.
 
-    Attributes
-    ----------
-    name, reference : what they are called, and where they were published
-    redshift : of the middle of their band
-    k : h/Mpc, (Nk,)
-    delta2 : upper limits of Delta^2, mK^2, (Nk,)
+    k is ascending, h/Mpc, (Nk,), and `delta2` are upper limits of Delta^2, mK^2, (Nk,).
     """
 
     name: str

@@ -208,9 +208,7 @@ def _one(sample: Sample) -> np.ndarray:
 
 QUANTITIES = {
     "ratio": Quantity(
-        "P^R / P^S",
-        lambda s: _over_eor(s.residual.power.real, s),
-        lambda s: _over_eor(s.residual.difference_error, s),
+        "P^R / P^S", lambda s: _over_eor(s.residual.power.real, s), lambda s: _over_eor(s.residual.difference_error, s)
     ),
     "bias": Quantity(
         "P^R0 / P^S", lambda s: _over_eor(s.without_eor.power.real, s), lambda s: _over_eor(s.without_eor.error, s)
@@ -363,8 +361,7 @@ def mean_over_bins(values: np.ndarray, design: Design) -> Finding:
 def error_ratio(values: np.ndarray, quoted: np.ndarray) -> Finding:
     """Return the scatter over the realizations of a block over the quoted error, rms over bins, with a jackknife error.
 
-    `values` and `quoted` are (K, Nbins). A ratio of one means that the quoted errors are right for the parts that the
-    block draws.
+    `values` and `quoted` are (K, Nbins). A ratio of one means that quoted errors are right for what the block draws.
     """
     known = np.isfinite(values).all(axis=0) & np.isfinite(quoted).all(axis=0)
     count = len(values)
@@ -410,8 +407,7 @@ class Corrected:
 def transfer_of_others(values: np.ndarray, design: Design) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean T of other realizations, and the expected deviation of each one's own T from it, (K, Nk) each.
 
-    `values` are T of all realizations, (K, Nk). A block of the design with fewer than two other realizations leaves the
-    deviation unknown: NaN.
+    `values` are T of all realizations, (K, Nk). With fewer than two others in a block the deviation is NaN.
     """
     mean, variance = np.empty(values.shape), np.zeros(values.shape)
     for own in range(len(values)):

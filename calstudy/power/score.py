@@ -85,10 +85,7 @@ class Score:
 class Difference:
     """How the scores of two calibrations of the same data differ in Nk bins of |k|, outside the wedge.
 
-    Attributes
-    ----------
-    transfer, transfer_error : T s^2 of the first less that of the second, and its standard deviation, (Nk,)
-    bias, bias_error : the same of s^2 P^R0 / P^S
+    T s^2 of the first less that of the second, the same of s^2 P^R0 / P^S, and their standard deviations, (Nk,) each.
     """
 
     transfer: np.ndarray
@@ -132,13 +129,8 @@ def difference(
 ) -> Difference:
     """Return how the scores of two calibrations of the same data differ, of the units that both have.
 
-    Raises InputError if they have no unit in common.
-
-    Parameters
-    ----------
-    calibrations : their spectra
-    edges, buffer : as for `score`
-    flux_scales : s of both; NaN if not known
+    `edges` and `buffer` are as for `score`; `flux_scales` are s of both, NaN if not known. Raises InputError if they
+    have no unit in common.
     """
     limits = np.asarray(edges, dtype=float)
     common = of_common_units(

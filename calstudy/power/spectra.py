@@ -186,8 +186,7 @@ class SphericalSpectrum:
     def difference_error(self) -> np.ndarray:
         """Standard deviation of P - P_S, (Nk,), where the EoR that P contains is the one whose power is P_S.
 
-        Both contain the sample variance of a mode (`calstudy.power.binned`). The noise remains, and the product of
-        signal and noise.
+        Both contain the sample variance of a mode (`calstudy.power.binned`). Noise and its product with signal remain.
         """
         noise, sample = self.noise_error, self.sample_error
         modes = np.sqrt(2 * self.noise_modes * self.sample_modes)
@@ -201,13 +200,18 @@ def outside_wedge(modes: DelaySpectra | BaselineModes, buffer: float) -> np.ndar
     return np.abs(modes.delay) > horizon[:, None] + buffer
 
 
-def bins_of_k(modes: DelaySpectra | BaselineModes, edges: np.ndarray) -> np.ndarray:
+def bins_of_k(
+    modes: DelaySpectra | BaselineModes, edges: np.ndarray, buffer: float | None = None, inside: bool = False
+) -> np.ndarray:
     """Return the bin of |k| of each mode, (Nu, Nd) int, -1 for those in none.
 
-    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge.
+    `edges` are ascending, h/Mpc; a bin holds modes above its lower and not above its upper edge. With a buffer, s, bins
+    hold only modes outside the wedge (`outside_wedge`), or only those `inside`.
     """
     bins = np.searchsorted(edges, np.hypot(modes.k_perp[:, None], modes.k_parallel), side="left") - 1
     bins[bins >= edges.size - 1] = -1
+    if buffer is not None:
+        bins[outside_wedge(modes, buffer) == inside] = -1
     return bins
 
 
@@ -270,8 +274,7 @@ def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelayS
 def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
     """Gather the pairs of a `UVPSpec` of `calstudy.power.estimate.estimate_power` into units.
 
-    `settings` hold the taper and cosmology with which `uvp` was made. Raise ValueError if it has several spectral
-    windows or times.
+    `settings` are those with which it was made. Raise ValueError if it has several spectral windows or times.
     """
     if uvp.Nspws != 1 or uvp.Nbltpairs != uvp.Nblpairs:
         raise ValueError(f"the spectra have {uvp.Nspws} spectral windows and {uvp.Ntpairs} times, expected 1 and 1")

@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, outside_wedge
+from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -410,22 +410,16 @@ class ExpectedBins:
 
 
 def bin_expected(
-    modes: BaselineModes,
-    transfer: np.ndarray,
-    error: np.ndarray,
-    edges: ArrayLike,
-    buffer: float,
-    length_bin: float,
+    modes: BaselineModes, transfer: np.ndarray, error: np.ndarray, edges: ArrayLike, buffer: float, length_bin: float
 ) -> ExpectedBins:
     """Average the expected transfer function, (Nbls, Ndelays), and its error over bins; NaN without data.
 
-    `edges` and `buffer` are as in `calstudy.power.clusters.clusters_in_k`. `length_bin` is the width of the bins of
-    baseline length, m.
+    `edges` and `buffer` are as in `calstudy.power.clusters.clusters_in_k`. `length_bin` is a width, m.
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)
-    bins, used = bins_outside(modes, limits, buffer)
-    used &= known
+    bins = bins_of_k(modes, limits, buffer)
+    used = (bins >= 0) & known
     count = np.bincount(bins[used], minlength=limits.size - 1)
     total = np.bincount(bins[used], transfer[used], limits.size - 1)
     square = np.bincount(bins[used], error[used] ** 2, limits.size - 1)
@@ -448,11 +442,7 @@ def bin_expected(
 
 
 def bin_response(
-    modes: BaselineModes,
-    signal: np.ndarray,
-    responses: tuple[np.ndarray, np.ndarray],
-    edges: ArrayLike,
-    buffer: float,
+    modes: BaselineModes, signal: np.ndarray, responses: tuple[np.ndarray, np.ndarray], edges: ArrayLike, buffer: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return T = Re <D* D'> / P^S and C = Re <S* (D + D')> / 2 P^S outside the wedge, (Nk,) each; NaN without signal.
 
@@ -460,7 +450,8 @@ def bin_response(
     it, (Nbls, Ndelays), complex; `edges` and `buffer` are as in `bin_expected`.
     """
     limits = np.asarray(edges, float)
-    bins, used = bins_outside(modes, limits, buffer)
+    bins = bins_of_k(modes, limits, buffer)
+    used = bins >= 0
     first, second = responses
     left, crossed, put_in = (
         np.bincount(bins[used], np.real(one.conj() * other)[used], limits.size - 1)
@@ -468,9 +459,3 @@ def bin_response(
     )
     put_in = np.where(put_in > 0, put_in, np.nan)
     return left / put_in, crossed / put_in
-
-
-def bins_outside(modes: BaselineModes, limits: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bin of |k| of each mode, and a mask of the modes that are in a bin and outside the wedge."""
-    bins = bins_of_k(modes, limits)
-    return bins, outside_wedge(modes, buffer) & (bins >= 0)

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-from calstudy.power.spectra import BaselineModes
-from calstudy.power.transfer import bins_outside
+from calstudy.power.spectra import BaselineModes, bins_of_k
 
 LEAST = 0.1
 """Smallest W_bb with which a bin b has a result."""
@@ -119,7 +118,8 @@ def window_matrix(
     edges, buffer : as in `calstudy.power.transfer.bin_response`
     """
     n_bins = edges.size - 1
-    bins, used = bins_outside(modes, edges, buffer)
+    bins = bins_of_k(modes, edges, buffer)
+    used = bins >= 0
     even, odd = left
     power = np.mean((even.conj() * odd).real, axis=0)
     whole = np.bincount(bins[used], put_in[used], n_bins)

@@ -176,7 +176,7 @@ class SimulateEor(Task, stage="observed-eor", version=3):
             raise ValueError("the template of the simulation has other baselines than the data")
         field = EorField(self.eor, template.freq_array, make_cosmology(self.cosmology))
         beam, simulation = make_beam(self.beam, self.channels), self.simulation
-        accuracy = simulation.nodes.for_eor(smooth_beam=model_of(self.beam).smooth)
+        accuracy = simulation.nodes.accuracy(eor=True, smooth_beam=model_of(self.beam).smooth)
         chunks = plan_chunks(template, accuracy, simulation.chunks)
         cubes = [
             simulate_chunk(simulation.engine, field.sky(chunk.channels), beam, template, chunk) for chunk in chunks
@@ -190,7 +190,7 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         size, simulation = size_of(self), self.simulation
         pixels, channels = 12 * self.eor.nside**2, size.channels.count
         slots = size.times * channels
-        tolerance = simulation.nodes.for_eor(smooth_beam=True).tolerance
+        tolerance = simulation.nodes.accuracy(eor=True).tolerance
         engine = simulation.engine.cost(SimulationSize(pixels, slots, slots, size.antennas, 1, tolerance))
         at_once = channels / min(simulation.chunks, channels)
         disk = size.samples * COMPLEX128

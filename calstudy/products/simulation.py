@@ -142,7 +142,7 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
         size, eor = size_of_instrument(instrument), isinstance(sky, Eor)
         sources = 12 * sky.nside**2 if isinstance(sky, Eor) else _sources(self)
         kept = 0.0 if eor else DRAWN_SOURCE * _drawn(sky)
-        accuracy = simulation.nodes.for_eor(True) if eor else simulation.nodes.for_foregrounds(True, smooth_sky=True)
+        accuracy = simulation.nodes.accuracy(eor)
         nodes = _node_counts(instrument, accuracy, size.longest)
         patches = _node_counts(instrument, accuracy, size.longest * _patch_radius(sources), TYPICAL_ERROR)
         pieces = _pieces(simulation, sky, instrument)

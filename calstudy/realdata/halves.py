@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,15 +75,7 @@ class Facts:
 
     def size(self, n_times: int) -> Size:
         """Return the size of `n_times` of the integrations."""
-        lengths = np.array([np.linalg.norm(vector) for vector in self.frame.vectors[~self.frame.autos]])
-        return Size(
-            antennas=self.antennas,
-            times=n_times,
-            channels=self.channels,
-            polarizations=self.frame.n_polarizations,
-            longest=float(lengths.max()),
-            mean=float(lengths.mean()),
-        )
+        return replace(Size.of_frame(self.frame), antennas=self.antennas, times=n_times, channels=self.channels)
 
 
 @dataclass(frozen=True)

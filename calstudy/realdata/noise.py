@@ -83,8 +83,7 @@ def uncorrelated(data: UVData) -> list[int]:
     """Return the numbers of antennas that see no sky: their cross-correlations are zero, flagged, noise or cross-talk.
 
     Of noise alone is a baseline whose median of |V|^2 / sigma^2, by the radiometer equation, is less than `ABOVE_NOISE`
-    times that of noise. None are named if they were half of all: then the data are no measure of them. `data` are
-    rectangular and time-major.
+    times that of noise. None are named if they were half of all: then the data are no measure of them.
     """
     pairs = antenna_pairs(data)
     crosses = np.not_equal(*pairs.T)
@@ -105,8 +104,7 @@ def uncorrelated(data: UVData) -> list[int]:
 def half_difference(even: UVData, odd: UVData) -> UVData:
     """Return the difference of two averages, with the power P_N of the noise of their product.
 
-    Both have one integration of the same baselines, phased to the same point, and are not changed. Samples flagged in
-    either are flagged.
+    Both have one integration of the same baselines, phased to the same point. Samples flagged in either are flagged.
     """
     found = even.copy()
     n_even, n_odd = (_weights(uvd) for uvd in (even, odd))
@@ -141,8 +139,7 @@ def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> 
     """Return P_N of each baseline, the mean over delays, (Nu,); NaN for a baseline without delays beyond the buffer.
 
     `noise` is the power of `half_difference`, or of the real noise from autocorrelations, of each baseline with itself.
-    Unless `everywhere`, delays within |b|/c + `buffer` (s) are left out: they contain changes of the sky between the
-    halves.
+    Unless `everywhere`, delays within |b|/c + `buffer` (s) are left out: there the sky changes between halves.
     """
     used = np.ones(noise.power.shape, bool) if everywhere else outside_wedge(noise, buffer)
     count = used.sum(axis=1)

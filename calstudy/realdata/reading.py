@@ -124,18 +124,11 @@ def _require_plausible(data: UVData, names: str) -> None:
 
 
 def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
-    """Select, unphase, order and fill a data set; the given one is not changed.
+    """Select, unphase, order and fill a data set, and describe each change in one sentence; the given is not changed.
 
-    Raises InputError if nothing is left, the polarizations are not of feeds, or less than half of the samples are at
-    common times.
-
-    Returns
-    -------
-    data
-        Parallel hands only, drift-scan, every baseline once at every time in time-major order; samples that were
-        missing, of no measurement or not finite are flagged.
-    notes
-        One sentence for each change.
+    The result has parallel hands only, is drift-scan, and has every baseline once at every time in time-major order;
+    samples that were missing, of no measurement or not finite are flagged. Raises InputError if nothing is left, the
+    polarizations are not of feeds, or less than half of the samples are at common times.
     """
     notes: list[str] = []
     data = select(data, replace(selection, times=None)).copy()

@@ -100,8 +100,7 @@ def simulate_chunk(
 ) -> np.ndarray:
     """Simulate a chunk in Jy at all integrations and at its frequency nodes, (Ntimes, Nbls, Nf, Npols) complex128.
 
-    `template` is the whole observation. `sky` is the whole sky; if it is given channel by channel, it needs only the
-    channels of the chunk.
+    Template and sky are the whole ones; a sky that is given channel by channel needs only the channels of the chunk.
     """
     frame = subset_template(template, integration_times(template), chunk.frequencies)
     part = chunk.select(sky)
@@ -152,8 +151,7 @@ def check_interpolation(
     simulate
         Returns the visibilities at the integrations and channels of a template, (Ntimes, Nbls, Nfreqs, Npols): an
         engine's `simulate` with the sky and beam of the simulation.
-    cube : (Ntimes, Nbls, Nfreqs, Npols)
-        Interpolated visibilities at all channels.
+    cube : interpolated visibilities at all channels, (Ntimes, Nbls, Nfreqs, Npols)
     chunk : any chunk of the simulation, for its nodes
     channels : channels to choose from: those of the sky, if it is given channel by channel
     count : number of integrations, and of channels, spread over the observation; each is as far from nodes as possible
@@ -231,10 +229,9 @@ class Component:
     def accuracy(self) -> Accuracy:
         """Tolerance of the interpolation, and whether beam and sky are smooth in frequency."""
         beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
-        smooth_beam, nodes = all(model_of(beam).smooth for beam in beams), self.simulation.nodes
-        if self.is_eor:
-            return nodes.for_eor(smooth_beam)
-        return nodes.for_foregrounds(smooth_beam, smooth_sky=self._foregrounds.spectral_type in SMOOTH_SPECTRA)
+        smooth_beam = all(model_of(beam).smooth for beam in beams)
+        smooth_sky = not self.is_eor and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+        return self.simulation.nodes.accuracy(self.is_eor, smooth_beam, smooth_sky)
 
     @cached_property
     def chunks(self) -> list[Chunk]:

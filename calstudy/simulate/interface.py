@@ -28,18 +28,12 @@ class SimulationSize:
 
     Attributes
     ----------
-    sources
-        Number of components of the sky, above and below the horizon.
-    slots
-        Number of combinations of time and frequency nodes.
-    patch_slots
-        The same for each patch of neighbouring sources (`calstudy.simulate.patches`).
-    beams
-        Number of distinct beams.
-    tolerance
-        Tolerance of the interpolation, 0 for none.
-    regular
-        Whether the antennas are on a flat lattice.
+    sources : number of components of the sky, above and below the horizon
+    slots : number of combinations of time and frequency nodes
+    patch_slots : the same for each patch of neighbouring sources (`calstudy.simulate.patches`)
+    beams : number of distinct beams
+    tolerance : tolerance of the interpolation, 0 for none
+    regular : whether the antennas are on a flat lattice
     """
 
     sources: float
@@ -75,21 +69,10 @@ class Engine(Plugin, ABC):
     def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Simulate every time, baseline, frequency and polarization of the template; change none of the arguments.
 
-        It is called only with arguments that `refusal` accepts.
-
-        Parameters
-        ----------
-        sky
-            Points or HEALPix, in Jy or K, of any spectral type.
-        beam
-            One for all antennas, or `AntennaBeams`.
-        template
-            Rectangular observation without data (see `calstudy.base.visibilities`).
-
-        Returns
-        -------
-        (Ntimes, Nbls, Nfreqs, Npols) complex128
-            Uncalibrated drift-scan visibilities in Jy, V_xx = 1/2 int A I, in the template's order.
+        It is called only with arguments that `refusal` accepts: a sky of points or HEALPix, in Jy or K, of any spectral
+        type; a beam for all antennas, or `AntennaBeams`; and a rectangular observation without data
+        (`calstudy.base.visibilities`). The uncalibrated drift-scan visibilities are in Jy, V_xx = 1/2 int A I, in the
+        template's order, (Ntimes, Nbls, Nfreqs, Npols) complex128.
         """
 
     def interpolate(
@@ -123,18 +106,11 @@ class Engine(Plugin, ABC):
 
 
 def simulate_with(
-    engine: Engine,
-    sky: SkyModel,
-    beam: AntennaBeam | AntennaBeams,
-    template: UVData,
-    accuracy: Accuracy = EXACT,
+    engine: Engine, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy = EXACT
 ) -> np.ndarray:
     """Simulate visibilities with an engine and check them, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 
-    Raises
-    ------
-    InputError
-        If the engine refuses or fails, or returns visibilities of another shape or that are not finite.
+    Raises InputError if the engine refuses or fails, or returns visibilities of another shape or that are not finite.
     """
     require_rectangular(template)
     with guarded(engine):

@@ -98,13 +98,11 @@ class Patches:
 
     Attributes
     ----------
-    components : (N,) int
-        The components in the order of the patches.
+    components : the components in the order of the patches, (N,) int
     tracks : tracks of these components, in this order
     members : slice of the components of each patch
     centres : tracks of the mean directions of the patches, which are fixed points of the sky, as sources are
-    radii : (Npatches,) float
-        Largest distance of a source from the centre of its patch, rad.
+    radii : largest distance of a source from the centre of its patch, rad, (Npatches,)
     """
 
     def __init__(self, sky: SkyModel, tracks: SourceTracks, components: np.ndarray, nside: int) -> None:
@@ -175,8 +173,7 @@ class PatchedArray:
     def choose_nside(self, sources: int, times: np.ndarray, dtype: type) -> int:
         """Choose the grid whose cells are patches: small ones for products, or the best one if transforms are faster.
 
-        `times` are the Julian dates to which patches are interpolated, (Nt,), and `dtype` is the precision of the
-        products.
+        `times` are the Julian dates to which patches are interpolated, (Nt,), and `dtype` is that of the products.
         """
         small = patch_nside(sources)
         if self._flat is None or dtype is np.float64 or not small:
@@ -233,8 +230,7 @@ class PatchSum:
     def add(self, total: np.ndarray, place: int, axis: Axis, times: np.ndarray) -> None:
         """Add the patch of index `place` to a total (Nfreqs, Nt, Nfeeds, Nbls) at the Julian dates `times`, (Nt,).
 
-        `axis` has the time nodes of the patch. If every time is a node, nothing is interpolated, and sources may be
-        below the horizon.
+        `axis` has the time nodes of the patch. If every time is a node, sources may be below the horizon.
         """
         if not axis.at_samples:
             self._add(total, place, axis, times)

@@ -29,16 +29,10 @@ class Pattern(Protocol):
 
 
 def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: list[str]) -> Pattern:
-    """Return the power pattern of some feeds of an E-field beam at some frequencies.
+    """Return the power pattern of some feeds, such as "x" and "y", of an E-field beam at frequencies in Hz, (Nfreqs,).
 
     Raises InputError if the beam is not an E-field beam with these feeds, or is a tabulated one that is not
     peak-normalized, not on a regular grid in azimuth and zenith angle, or not at these frequencies.
-
-    Parameters
-    ----------
-    frequencies : (Nfreqs,) float
-        Frequencies in Hz.
-    feeds : names of the feeds, such as "x" and "y"
     """
     reason = refusal(beam, feeds)
     if reason:

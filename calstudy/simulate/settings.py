@@ -33,21 +33,15 @@ class Nodes(Section):
         "hundredth of it.",
     )
     beam_extent: Length = Field(
-        20.0,
-        ge=10,
-        description="Length added to baselines for the structure of the beam in fringe rate and delay.",
+        20.0, ge=10, description="Length added to baselines for the structure of the beam in fringe rate and delay."
     )
 
-    def for_eor(self, smooth_beam: bool) -> Accuracy:
-        """Return the accuracy for the EoR, whose channels are independent."""
-        return self._accuracy(self.eor_tolerance, smooth_beam, smooth_sky=False)
-
-    def for_foregrounds(self, smooth_beam: bool, smooth_sky: bool) -> Accuracy:
-        """Return the accuracy for the foregrounds; the arguments say whether beam and sky are smooth in frequency."""
-        return self._accuracy(self.tolerance, smooth_beam, smooth_sky)
-
-    def _accuracy(self, tolerance: float, smooth_beam: bool, smooth_sky: bool) -> Accuracy:
-        return Accuracy(tolerance, self.beam_extent, smooth_beam, smooth_sky) if self.enabled else EXACT
+    def accuracy(self, eor: bool, smooth_beam: bool = True, smooth_sky: bool = True) -> Accuracy:
+        """Return the accuracy for the EoR, whose channels are independent, or for foregrounds of smooth spectra."""
+        if not self.enabled:
+            return EXACT
+        tolerance = self.eor_tolerance if eor else self.tolerance
+        return Accuracy(tolerance, self.beam_extent, smooth_beam, smooth_sky and not eor)
 
 
 class SimulationSettings(Section):

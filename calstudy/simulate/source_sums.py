@@ -59,15 +59,11 @@ class PairSums:
 
     Attributes
     ----------
-    delays : (Nants, 3) float
-        Positions of the antennas over the speed of light, s, in east, north, up.
-    pairs : two arrays (Nbls,) int
-        First and second antenna of each baseline.
-    frequencies : (Nfreqs,) float
-        Frequencies in Hz, ascending.
+    delays : positions of the antennas over the speed of light, s, in east, north, up, (Nants, 3)
+    pairs : first and second antenna of each baseline, two arrays (Nbls,) int
+    frequencies : in Hz, ascending, (Nfreqs,)
     patterns : distinct beams at these frequencies
-    index : (Nants,) int
-        Index of the beam of each antenna.
+    index : index of the beam of each antenna, (Nants,) int
     dtype : precision of the products, float64 or float32
     """
 

@@ -17,12 +17,7 @@ from pyradiosky.utils import jy_to_ksr
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import use_bundled_earth_orientation
-from calstudy.simulate.nodes import (
-    EARTH_ROTATION_RATE,
-    chebyshev_count,
-    chebyshev_nodes,
-    interpolation_matrix,
-)
+from calstudy.simulate.nodes import EARTH_ROTATION_RATE, chebyshev_count, chebyshev_nodes, interpolation_matrix
 
 
 def is_polarized(sky: SkyModel) -> bool:
@@ -31,25 +26,15 @@ def is_polarized(sky: SkyModel) -> bool:
 
 
 def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Return Stokes I of a sky in Jy, with the same conventions as pyuvsim.
+    """Return Stokes I of a sky in Jy, (Nfreqs, Ncomponents), with the same conventions as pyuvsim.
+
+    The sky has points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type. Frequencies are in Hz, (Nfreqs,);
+    `components` are indices, all by default. Flux densities that are the same at all frequencies are a read-only view
+    that does not repeat them in memory.
 
     HEALPix pixels count as points that hold the pixel's integral, and brightness temperatures are converted at the
     reference frequency of a spectral-index or flat component, or else at each frequency (Rayleigh-Jeans). Raises
-    InputError if a spectral index is not a number, a `full` sky lacks one of the frequencies, or a `subband` sky does
-    not span them.
-
-    Parameters
-    ----------
-    sky : points in Jy or K sr, or HEALPix in Jy/sr or K, of any spectral type
-    frequencies : (Nfreqs,) float
-        Frequencies in Hz.
-    components : indices of the components, all by default
-
-    Returns
-    -------
-    (Nfreqs, Ncomponents) float
-        Flux densities in Jy. If they are the same at all frequencies, a read-only view that does not repeat them in
-        memory.
+    InputError if a spectral index is not a number, or the sky lacks one of the frequencies.
     """
     if sky.spectral_type == "subband":
         sky = sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False)

@@ -115,18 +115,15 @@ def box_power(path: Path, band: tuple[float, float]) -> tuple[np.ndarray, np.nda
 def measure_power(brightness: np.ndarray, cell: float, depth: float, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return k and P(k) = ⟨|∫ T(x) exp(-ikx) dx|²⟩ / volume, averaged over directions, in logarithmic bins of k.
 
-    Bins end at the Nyquist wavenumber of the larger size of a cell, and those without modes are left out. The
-    smoothing by the cell is not corrected: k that an interferometer measures are far below that.
+    Brightness is in mK, (Nx, Ny, Nz), the line of sight last; it is overwritten, for boxes are large. `cell` and
+    `depth` are the size of a cell across and along the line of sight, Mpc, and `periodic` is whether the latter is.
+
+    Bins end at the Nyquist wavenumber of the larger size of a cell, and those without modes are left out. The smoothing
+    by the cell is not corrected: k that an interferometer measures are far below that.
 
     The mean is removed: of a periodic box that of all cells, otherwise that of each slice, for the evolution of the
     mean has no structure on the sky, and interferometers do not see it. Lines of sight that are not periodic are
     tapered with sin², divided by its mean square, or what does not close would leak to high k.
-
-    Parameters
-    ----------
-    brightness : (Nx, Ny, Nz) in mK, the line of sight last; it is overwritten, for boxes are large
-    cell, depth : size of a cell across and along the line of sight, Mpc
-    periodic : whether the line of sight is
     """
     taper = np.ones(brightness.shape[2])
     if not periodic:

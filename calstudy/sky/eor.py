@@ -35,11 +35,8 @@ class EorField:
     the pixel (maps are samples at pixel centres, band-limited at ℓ = 3 nside − 1 for the power law). A delay spectrum
     therefore recovers P itself. In the flat case the brightness is constant within a pixel.
 
-    Parameters
-    ----------
-    frequencies : (Nfreqs,) float
-        All channel centres of the study in Hz, at least two, increasing and equally spaced; ValueError otherwise.
-    cosmology : converts P(k) to brightness; the power spectrum estimator must use the same cosmology
+    `frequencies` are all channel centres of the study in Hz, at least two, increasing and equally spaced, (Nfreqs,);
+    ValueError otherwise. The cosmology converts P(k) to brightness; the power spectrum estimator must use the same.
     """
 
     def __init__(self, settings: Eor, frequencies: np.ndarray, cosmology: FLRW = Planck15) -> None:
@@ -113,13 +110,9 @@ class EorField:
         roots = self.covariance_roots(lmax)
         for ell in range(lmax + 1):
             root = roots(np.log(ell + 0.5))
-            generator = np.random.default_rng(np.random.SeedSequence(self.settings.seed, spawn_key=(ell,)))
-            # Complex of unit variance for m > 0; m = 0 is real.
-            normal = generator.standard_normal((2, n_channels, ell + 1)) / np.sqrt(2)
-            normal[0, :, 0] *= np.sqrt(2)
-            normal[1, :, 0] = 0.0
+            real, imaginary = draw_harmonics(self.settings.seed, ell, n_channels)
             orders = healpy.Alm.getidx(lmax, ell, np.arange(ell + 1))
-            harmonics[:, orders] = root @ normal[0] + 1j * (root @ normal[1])
+            harmonics[:, orders] = root @ real + 1j * (root @ imaginary)
         return harmonics
 
     def covariance_factor(self, ell: float) -> np.ndarray:
@@ -151,6 +144,15 @@ class EorField:
         """
         nodes = np.linspace(np.log(0.5), np.log(lmax + 0.5), ROOT_NODES)
         return CubicSpline(nodes, [_triangular_root(self.covariance_factor(np.exp(node) - 0.5)) for node in nodes])
+
+
+def draw_harmonics(seed: int, ell: int, *shape: int) -> np.ndarray:
+    """Draw a_lm of unit variance of one ℓ, real and imaginary parts, (2, ..., ℓ + 1); m = 0 is real."""
+    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ell,)))
+    normal = generator.standard_normal((2, *shape, ell + 1)) / np.sqrt(2)
+    normal[0, ..., 0] *= np.sqrt(2)
+    normal[1, ..., 0] = 0.0
+    return normal
 
 
 def input_power(settings: Eor, k: np.ndarray, hubble: float, band: tuple[float, float] | None = None) -> np.ndarray:

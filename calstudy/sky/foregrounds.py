@@ -34,6 +34,7 @@ from calstudy.sky.catalogue import (
     with_errors,
 )
 from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
+from calstudy.sky.eor import draw_harmonics
 
 HASLAM_FREQUENCY = 408e6
 # The map is in tenths of a kelvin, on a grid of 20 arcmin in B1950 coordinates, its middle at (0, 0).
@@ -79,13 +80,9 @@ def _synthetic_diffuse(settings: section.SyntheticDiffuse) -> np.ndarray:
     variance = np.sum((2 * degree + 1) * spectrum) / (4 * np.pi)
     harmonics = np.zeros(healpy.Alm.getsize(lmax), dtype=complex)
     for ell in range(1, lmax + 1):
-        generator = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(ell,)))
-        # Complex of unit variance for m > 0; m = 0 is real.
-        normal = generator.standard_normal((2, ell + 1)) / np.sqrt(2)
-        normal[0, 0] *= np.sqrt(2)
-        normal[1, 0] = 0.0
+        real, imaginary = draw_harmonics(settings.seed, ell)
         orders = healpy.Alm.getidx(lmax, ell, np.arange(ell + 1))
-        harmonics[orders] = np.sqrt(spectrum[ell - 1] / variance) * (normal[0] + 1j * normal[1])
+        harmonics[orders] = np.sqrt(spectrum[ell - 1] / variance) * (real + 1j * imaginary)
     return settings.mean + settings.rms * healpy.alm2map(harmonics, settings.nside, lmax=lmax)
 
 
@@ -130,8 +127,7 @@ def describe(settings: section.HaslamMap | section.SyntheticDiffuse) -> str:
 def add_skies(points: SkyModel, diffuse: SkyModel, frequencies: np.ndarray) -> SkyModel:
     """Return a catalogue of points and a diffuse map from `make_diffuse` as one sky.
 
-    The spectra are power laws if those of the catalogue are flat or power laws. Otherwise the sky is given at all
-    channels in Hz, (Nfreqs,).
+    The spectra are power laws if those of the catalogue are flat or power laws, or else given at channels in Hz.
     """
     if points.spectral_type in ("flat", "spectral_index"):
         spectra = {

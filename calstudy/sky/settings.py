@@ -33,9 +33,7 @@ class CatalogueErrors(Section):
         0.0, ge=0, description="Standard deviation of the relative error of each flux, constant over the band."
     )
     position_scatter: Angle = Field(
-        0.0,
-        ge=0,
-        description="Standard deviation of the error of each position, in each of two directions.",
+        0.0, ge=0, description="Standard deviation of the error of each position, in each of two directions."
     )
     index_scatter: float = Field(
         0.0, ge=0, description="Standard deviation of the error of each spectral index, about the flux at 200 MHz."
@@ -135,14 +133,11 @@ class FileSources(PointSources):
     csv: CsvColumns | None = Field(None, description="Required for a CSV (.csv).")
 
     @model_validator(mode="after")
-    def _csv_has_columns(self) -> FileSources:
-        if (self.path.suffix.lower() == ".csv") != (self.csv is not None):
+    def _tables_have_columns(self) -> FileSources:
+        suffix = self.path.suffix.lower()
+        if (suffix == ".csv") != (self.csv is not None):
             raise fault("csv", "is required for CSV files (.csv), and not allowed for other files")
-        return self
-
-    @model_validator(mode="after")
-    def _votables_have_columns(self) -> FileSources:
-        if (self.path.suffix.lower() in VOTABLE_SUFFIXES) != (self.votable is not None):
+        if (suffix in VOTABLE_SUFFIXES) != (self.votable is not None):
             suffixes = ", ".join(VOTABLE_SUFFIXES)
             raise fault("votable", f"is required for VOTables ({suffixes}), and not allowed for other files")
         return self
@@ -180,8 +175,7 @@ class NoSources(Section):
 
 
 Foregrounds = Annotated[
-    GleamSources | SyntheticSources | FileSources | CodeSources | NoSources,
-    choice("kind", "g4jy-and-counts"),
+    GleamSources | SyntheticSources | FileSources | CodeSources | NoSources, choice("kind", "g4jy-and-counts")
 ]
 
 

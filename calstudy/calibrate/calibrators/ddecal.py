@@ -181,8 +181,7 @@ def _empty(frame: Frame, n_times: int) -> UVData:
     """Return visibilities without values.
 
     The first antenna of each baseline has the lower number, as pyuvdata then writes it in the order of measurement
-    sets. Site, times and phase centre are arbitrary: they are the same for data and model, so that gains do not depend
-    on them.
+    sets. Site, times and phase centre are arbitrary: gains do not depend on them, for data and model have the same.
     """
     from astropy.coordinates import EarthLocation
     from pyuvdata import Telescope, UVData, utils

@@ -53,9 +53,8 @@ class NoCalibration(Calibrator):
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Return gains of one."""
-        shape = observation.visibilities.shape
-        n_times, n_polarizations = shape[0], shape[-1]
-        gains = np.ones((observation.numbers.size, shape[2], n_times, n_polarizations), complex)
+        n_times, _, n_channels, n_polarizations = observation.shape
+        gains = np.ones((observation.n_antennas, n_channels, n_times, n_polarizations), complex)
         count = n_polarizations * len(self.solves(n_times))
         if progress is not None:
             progress(count, count)
@@ -131,12 +130,8 @@ class ByFile(Calibrator):
         if progress is not None:
             progress(count, count)
         outcome = Solve(status="by-file", message=f"gains of {self.gains.name}")
-        return Calibration(gains=gains, gain_flags=flags, model=self._model(observation), outcomes=[outcome] * count)
-
-    def _model(self, observation: Observation) -> np.ndarray | None:
-        if self.model is None:
-            return None
-        return to_cube(read_sky_model(self.model, observation.uvd))
+        model = None if self.model is None else to_cube(read_sky_model(self.model, observation.uvd))
+        return Calibration(gains=gains, gain_flags=flags, model=model, outcomes=[outcome] * count)
 
 
 def _gains_at(path: Path, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
@@ -192,16 +187,11 @@ class Manifest(Section):
 
     Attributes
     ----------
-    calstudy
-        Version of calstudy that wrote it.
-    digest
-        Digest of all data sets and the sky model; it links the folder to the experiment.
-    sky_model
-        File of the assumed visibilities of the foregrounds; None if nothing is assumed.
-    sky_model_digest
-        Digest of all inputs of the sky model.
-    noise
-        Standard deviation of the complex noise of a sample, Jy; None if the data have none.
+    calstudy : version of calstudy that wrote it
+    digest : digest of all data sets and the sky model; it links the folder to the experiment
+    sky_model : file of the assumed visibilities of the foregrounds; None if nothing is assumed
+    sky_model_digest : digest of all inputs of the sky model
+    noise : standard deviation of the complex noise of a sample, Jy; None if the data have none
     """
 
     calstudy: str
@@ -242,8 +232,7 @@ def read_manifest(path: Path) -> Manifest:
 def find_returned(folder: Path, digest: str, sky_model: str | None) -> Returned:
     """Find the gains and model that were returned for a data set, in the world with a sky model.
 
-    The folder is that of one experiment, or has several such folders, one for each world of a comparison. Digests are
-    those of the manifest.
+    The folder is that of one experiment, or has one for each world of a comparison. Digests are those of the manifest.
 
     Raises InputError if no manifest has these data and this sky model, if there are no gains for them or several files,
     or if a file is a link that leads out of the folder.

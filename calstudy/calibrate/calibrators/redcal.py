@@ -201,8 +201,7 @@ class _Redundant:
     """Some integrations of redundant baselines, in the terms of hera_cal.
 
     hera_cal fails on samples without weight. They are replaced by the sky model with a negligible weight. In a cell (a
-    channel of an integration) that cannot be solved, the sky model replaces all samples, with unit weight; cells are
-    independent.
+    channel of an integration) that cannot be solved, it replaces all samples, with unit weight.
     """
 
     def __init__(self, settings: Redcal, measured: Measured, groups: RedundantGroups, times: slice) -> None:

@@ -279,10 +279,8 @@ class JointKernels:
         return descent, losses, self.loss.value(descent.parameters, data)
 
 
-@lru_cache(maxsize=4)
-def compiled(structure: FitStructure, precision: Precision, prior: Prior) -> JointKernels:
-    """Return the kernels of a structure and setting, compiled once for all its integrations and learning rates."""
-    return JointKernels(structure, precision, prior)
+compiled = lru_cache(maxsize=4)(JointKernels)
+"""The kernels of a structure, precision and prior, compiled once for all integrations and learning rates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,8 +350,7 @@ class Adamax:
     def _last_step(self, history: Sequence[float], done: int) -> int | None:
         """Return the number of the step after `done` at which the published rule stops, or None if it does not.
 
-        The authors compare the losses before two consecutive steps, and take the second of these. They do not record
-        the loss at the start.
+        The authors compare the losses before two consecutive steps, and take the second, but record none at the start.
         """
         steps = range(max(done + 1, 3), len(history))
         return next((step for step in steps if abs(history[step - 1] - history[step - 2]) < self.tolerance), None)

@@ -408,6 +408,6 @@ def _next_boost(boost: float, gain: float) -> float:
 
 def _in_double(state: GaussNewtonState, thorough: bool) -> GaussNewtonState:
     """Return a state whose products are made in double precision."""
-    kernels = state.kernels.in_double(thorough)
+    kernels = compiled(state.kernels.structure, state.kernels.frozen, tf.float64, thorough)
     projection = kernels.project(state.gains, *state.reduced.data)
     return replace(state, kernels=kernels, projection=projection, channel_steps=0, preconditioner=None)

@@ -28,11 +28,8 @@ HIDDEN_POWER, ROUNDING_POWER = 1e-8, 1e-10
 class Solution(NamedTuple):
     """Gains and foreground model of one integration and polarization, and how the solve ended.
 
-    Attributes
-    ----------
-    gains : shape (Nants, Nfreqs), complex128, dimensionless
-    model : intrinsic visibilities F, shape (Nbls, Nfreqs), complex128, in the unit of the data
-    record : its loss is in the unit of the data squared
+    Gains are dimensionless, (Nants, Nfreqs); the model is that of intrinsic visibilities F, (Nbls, Nfreqs), in the unit
+    of the data; both are complex128. The loss of the record is in the unit of the data squared.
     """
 
     gains: np.ndarray
@@ -43,10 +40,7 @@ class Solution(NamedTuple):
 class WarmStart(NamedTuple):
     """The start of the next solve with the same structure, such as the next integration, from a previous solution.
 
-    Attributes
-    ----------
-    gains : the solution's gains, shape (Nants, Nfreqs)
-    memory : anything that the solver can reuse; None if nothing
+    Gains are the solution's, (Nants, Nfreqs). `memory` is anything that the solver can reuse; None if nothing.
     """
 
     gains: np.ndarray
@@ -88,8 +82,7 @@ def solve_warm(
     """Solve one problem from a warm start, and return the solution with the warm start for the next.
 
     The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). A lack of convergence is a status,
-    not an error; after a failed solve there is no warm start. With `warm` of None the solve starts from the problem's
-    initial gains.
+    not an error; after a failed solve there is no warm start. By default the solve starts from the initial gains.
     """
     started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)

@@ -89,14 +89,10 @@ def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Ten
 
 
 class AntennaBlocks(NamedTuple):
-    """The channel blocks of each antenna, undamped.
+    """The channel blocks of each antenna, undamped: the degrees K, (Nants, Nfreqs), and what foregrounds absorb.
 
-    Attributes
-    ----------
-    degrees : K, (Nants, Nfreqs)
-    common : Q, (Nfreqs, rank); None, like all that follows, if there are no foregrounds
-    gram : Q^T K Q, (Nants, rank, rank)
-    absorbed : Q^T C Q, real and imaginary part, (2, Nants, rank, rank)
+    With Q, (Nfreqs, rank), the Gram matrix is Q^T K Q, (Nants, rank, rank), and `absorbed` is Q^T C Q, real and
+    imaginary part, (2, Nants, rank, rank). All but K are None if there are no foregrounds.
     """
 
     degrees: tf.Tensor
@@ -277,8 +273,7 @@ class CoordinateInverse(NamedTuple):
 def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Tensor) -> CoordinateInverse:
     """Invert the damped blocks for gains in a space of smooth ones.
 
-    `columns` are the relative changes of each antenna's gain for a unit of each coordinate, (Nants, Nfreqs, Ngain),
-    complex64.
+    `columns` are relative changes of gains for a unit of each coordinate, (Nants, Nfreqs, Ngain), complex64.
     """
     diagonal = tf.cast((1 + damping) * blocks.degrees, columns.dtype)
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)

@@ -205,10 +205,6 @@ class ReducedKernels:
         alone = not self.tensors.shared and self.structure.prior != "both"
         return alone and self.structure.gain_vectors is None and rows <= MOST_COUPLED
 
-    def in_double(self, thorough: bool) -> ReducedKernels:
-        """Return the kernels of the same fit with inner products in float64 (see `compiled`)."""
-        return compiled(self.structure, self.frozen, tf.float64, thorough)
-
     def scalar(self, value: float) -> tf.Tensor:
         """Return a number in the precision of the inner products."""
         return tf.constant(value, self.dtype)

@@ -232,9 +232,7 @@ class CoarseChannels(GainEffect):
 
     kind: str = "coarse-channels"
     width: Frequency = Field(
-        1.28e6,
-        gt=0,
-        description="Width of coarse channels, which are centred at its multiples; by default the MWA's.",
+        1.28e6, gt=0, description="Width of coarse channels, which are centred at its multiples; by default the MWA's."
     )
     level_scatter: Fraction = Field(
         0.0045,

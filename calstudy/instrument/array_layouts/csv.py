@@ -48,13 +48,7 @@ class CsvLayout(ArrayLayout):
         return f"instrument.layout.path: {self.path}"
 
     def make(self) -> Layout:
-        """Return the antennas of the file.
-
-        Raises
-        ------
-        InputError
-            If there is no such file, or it does not hold antenna positions.
-        """
+        """Return the antennas of the file; raises InputError if it is missing or does not hold antenna positions."""
         return read_positions(self.path)
 
 
