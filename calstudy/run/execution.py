@@ -294,16 +294,20 @@ def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
     return [task for task in kept if task.key not in found and store.exists(task.stage.name, task.key)]
 
 
-def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False) -> Schedule:
+def schedule(
+    targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False, quick: bool = False
+) -> Schedule:
     """Find the tasks to make: the targets and all that they need, unless the store has them intact.
 
     A kept product without an intact record is made again even if nothing else has to be made from it. Products with
     keys in `given` are not made. With `strict`, products of other code or other versions of packages are made again.
+    A `quick` look reads no files of products, and misses damaged ones behind what is intact.
     """
     other: Container[str] = ()
     if strict:
         tasks = unique(targets)
         other = of_other_code(tasks, found_of(tasks, store))
+    look, lost = (store.find, []) if quick else (store.verify, without_record(targets, store))
     again: set[str] = set()
     todo: dict[str, Task] = {}
     intact: set[str] = set()
@@ -312,7 +316,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
     def visit(task: Task) -> None:
         if task.key in todo or task.key in intact or task.key in given:
             return
-        product = store.verify(task.stage.name, task.key)
+        product = look(task.stage.name, task.key)
         if product is not None and task.key not in other:
             intact.add(task.key)
             return
@@ -324,7 +328,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
             visit(needed)
         todo[task.key] = task
 
-    for task in (*targets, *without_record(targets, store)):
+    for task in (*targets, *lost):
         visit(task)
     return Schedule(tuple(todo.values()), tuple(damaged), frozenset(again))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 from calstudy.base.errors import InputError
@@ -15,10 +14,9 @@ from calstudy.experiment.model import Experiment
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.simulation import SimulateChunk
-from calstudy.run.execution import Budget, found_of
-from calstudy.run.provenance import of_other_code
+from calstudy.run.execution import Budget, schedule
 from calstudy.run.store import Store
-from calstudy.run.task import Task, unique
+from calstudy.run.task import Task
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""
@@ -107,7 +105,9 @@ class _Work(Generic[File]):
 
     @cached_property
     def missing(self) -> Sequence[Task]:
-        return _missing(self.targets(self.file), self.file.outputs.store, self.strict)
+        """The tasks, from a quick look at the store."""
+        store = Store(self.file.outputs.store)
+        return schedule(self.targets(self.file), store, strict=self.strict, quick=True).todo
 
     def largest(self, kind: type[Task]) -> float:
         """Return the memory of the largest missing product of a kind; zero if none is missing."""
@@ -141,20 +141,3 @@ def _stream(work: _Work[File], share: float) -> _Work[File]:
             break
         work = work.changed(calibration=leaner)
     return work
-
-
-def _missing(targets: Sequence[Task], folder: Path, strict: bool) -> Sequence[Task]:
-    """Return the tasks whose products are missing in the store or, with `strict`, of other code, from a quick look."""
-    store, found = Store(folder), {}
-    tasks = unique(targets) if strict else []
-    other = of_other_code(tasks, found_of(tasks, store))
-
-    def visit(task: Task) -> None:
-        if task.key not in found and (task.key in other or store.find(task.stage.name, task.key) is None):
-            found[task.key] = task
-            for needed in task.needs.values():
-                visit(needed)
-
-    for task in targets:
-        visit(task)
-    return tuple(found.values())
