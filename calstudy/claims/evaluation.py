@@ -279,52 +279,29 @@ class Evaluated(NamedTuple):
     tables: Mapping[str, Task]
 
 
-def claims(run: Evaluated, notes: Sequence[str]) -> Task | None:
-    """Return the task that evaluates the statements of an experiment's papers on it alone; None without papers.
-
-    The notes are its substitutions for the papers' ingredients.
-    """
-    experiment = run.experiment
-    if not experiment.papers:
-        return None
-    return Claims(
-        "claims",
-        papers=list(experiment.papers),
-        title=experiment.name,
-        notes=list(notes),
-        experiments={"": _facts(experiment)},
-        tables=_inputs_of({"": run}),
-    )
-
-
-def combined_claims(
-    title: str, runs: Mapping[str, Evaluated], papers: Sequence[Paper], roles: Mapping[str, str], notes: Sequence[str]
+def claims(
+    title: str,
+    papers: Sequence[Any],
+    runs: Mapping[str, Evaluated],
+    notes: Sequence[str],
+    roles: Mapping[str, str] | None = None,
 ) -> Task | None:
-    """Return the task that evaluates the statements of papers on several runs by role; None without papers.
+    """Return the task that evaluates the statements of papers on a run, or on several by role; None without papers.
 
-    The notes are the substitutions of all members for the papers' ingredients.
+    A single run has no name. The notes are the substitutions of all runs for the papers' ingredients.
     """
-    playing = {name: runs[name] for name in roles.values()}
     if not papers:
         return None
+    playing = runs if roles is None else {name: runs[name] for name in roles.values()}
     return Claims(
-        "claims of all",
+        "claims" if roles is None else "claims of all",
         papers=list(papers),
         title=title,
         notes=list(notes),
-        roles=dict(roles),
+        roles=None if roles is None else dict(roles),
         experiments={name: _facts(run.experiment) for name, run in playing.items()},
-        tables=_inputs_of(playing),
+        tables={f"{table}:{name}": task for name, run in playing.items() for table, task in run.tables.items()},
     )
-
-
-def _inputs_of(runs: Mapping[str, Evaluated]) -> dict[str, Task]:
-    return {f"{table}:{name}": task for name, run in runs.items() for table, task in run.tables.items()}
-
-
-def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Task | None:
-    """Return the task that evaluates the statements of papers on a table of run times; None without papers."""
-    return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
 
 
 class Claims(Task, stage="claims", version=14, cost=Cost(1, disk=1e5)):

@@ -18,7 +18,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.files import sha256
 from calstudy.base.identity import identity
 from calstudy.base.schema import Section, fault
-from calstudy.claims.evaluation import combined_claims, members_by_role, refusal_of_role
+from calstudy.claims.evaluation import claims, members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
 from calstudy.experiment.files import StudyFile, apply_scale, checked, overridden, read_mapping, validate
 from calstudy.experiment.model import Experiment, Figures, StudyName
@@ -180,7 +180,7 @@ class Collection(Family):
         """The statements of the members' papers, each evaluated on the members that play its roles, or None."""
         runs = {name: study.evaluated for name, study in self.studies.items()}
         papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
-        return combined_claims(self.name, runs, papers, self.roles, self.stand_ins)
+        return claims(self.name, papers, runs, self.stand_ins, self.roles)
 
     def _place(self, name: str) -> str:
         """Return the path of a member's folder, relative to the folder of runs."""
