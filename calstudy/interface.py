@@ -275,12 +275,8 @@ class LoadedStudy:
     def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
         """Return the stages of a run with the estimated time, memory and disk.
 
-        Parameters
-        ----------
-        workers
-            Number of worker processes; by default one for each core, as far as the memory allows.
-        max_memory
-            Memory of all workers together, such as "6 GB"; by default all free memory.
+        By default there is a worker process for each core, as far as the memory allows. `max_memory` is that of all
+        workers together, such as "6 GB"; by default all free memory.
         """
         return StudyPlan(describe_plan(self._study, Budget(workers, max_memory)))
 
@@ -291,16 +287,9 @@ class LoadedStudy:
         scheduler: str | None = None,
         quiet: bool = False,
     ) -> OpenRun:
-        """Make all products that are not in the store, and fill the run folder.
+        """Make all products that are not in the store, and fill the run folder; if `quiet`, without printed progress.
 
-        Parameters
-        ----------
-        workers, max_memory
-            As for `plan`.
-        scheduler
-            Address of a running dask scheduler, in place of own workers.
-        quiet
-            If true, no progress is printed.
+        Workers and memory are as for `plan`; `scheduler` is the address of a running dask scheduler in place of them.
         """
         from rich.console import Console
 
@@ -459,15 +448,7 @@ class OpenRun:
         return {name: OpenRun(folder) for name, folder in self._folder.parts.items()}
 
     def gains(self, variant: str = "residual", half: Half = "even") -> UVCal:
-        """Return the gains of the calibration of a variant; "true" in place of a variant returns the true gains.
-
-        Parameters
-        ----------
-        variant
-            A calibrated variant.
-        half
-            Which of the two noise realizations.
-        """
+        """Return the gains of a calibrated variant, of one of the two noise realizations, or the "true" gains."""
         from pyuvdata import UVCal
 
         study = self._experiment
@@ -477,17 +458,8 @@ class OpenRun:
     def gain_errors(self, variant: str = "residual", half: Half = "even") -> xarray.Dataset:
         """Compute standard deviations of gains by noise, `amplitude` and `phase`, from the products in the store.
 
-        Parameters
-        ----------
-        variant
-            A calibrated variant.
-        half
-            Which of the two noise realizations.
-
-        Raises
-        ------
-        InputError
-            If they are not known for the calibrator or the size of the array, with the reason.
+        Variant and half are as for `gains`. Raises InputError, with the reason, if the errors are not known for the
+        calibrator or the size of the array.
         """
         self._calibration(variant, half)
         study = self._experiment
@@ -501,14 +473,9 @@ class OpenRun:
             return gain_errors(Path(folder) / GAINS)
 
     def visibilities(self, variant: str, half: Half = "even") -> UVData:
-        """Return the visibilities of a variant: the residual if it is calibrated, else the simulated data.
+        """Return the visibilities of a variant, such as "uncalibrated", of one of the two noise realizations.
 
-        Parameters
-        ----------
-        variant
-            A variant, such as "uncalibrated".
-        half
-            Which of the two noise realizations.
+        These are the residual if the variant is calibrated, else the simulated data.
         """
         study = self._experiment
         if self._variant(variant).calibrate:

@@ -172,15 +172,11 @@ class Kinds(Generic[S]):
         return [name for name in self.built_in() if key in self.find(name).model_fields]
 
     def make(self, block: Any, default: str | None = None, **context: Any) -> S:
-        """Return the section that a block of settings describes.
+        """Return the section that a name, a path or a block of settings describes; a section or word is unchanged.
 
-        Raises pydantic.ValidationError if the settings are invalid, and InputError if there is no such kind.
-
-        Parameters
-        ----------
-        block : a name or path, a block of settings with the tag, or a section or word, which is returned unchanged
-        default : name for a block without the tag
-        context : of the validation: `folder` is where relative paths of files start; the working directory without it
+        A block without the tag is of the kind `default`. Relative paths of files start at the `folder` of the context
+        of the validation, or at the working directory. Raises pydantic.ValidationError if the settings are invalid, and
+        InputError if there is no such kind.
         """
         if isinstance(block, self.base) or block in self.words:
             return block

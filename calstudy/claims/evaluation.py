@@ -182,14 +182,10 @@ INSTEAD = "use --run-code if you trust who wrote the folder, or, if it is a pape
 def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> Evaluation:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
-    If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too.
-    Raises InputError if it is neither, names no paper or code that may not be run, or cannot be written.
-
-    Parameters
-    ----------
-    folder : of a run (``experiment.yaml``, ``tables/``), or of a collection, whose members' folders are beside it
-    papers : names of papers, or files, in place of those that the run names
-    run_code : whether Python files in the folder's experiments may be run; those of `papers` always are
+    The folder is that of a run, or of a collection, whose members' folders are beside it. If members differ only in the
+    paper's own solver, claims-by-solver.json and .md are written too. `papers` are names or files in place of those
+    that the run names. Python files of these are always run, those of the folder's experiments only with `run_code`.
+    Raises InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
     """
     run = RunFolder(folder)
     _require_evaluable(run)

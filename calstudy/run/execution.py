@@ -211,13 +211,10 @@ BEGUN, WAITS = "begun", "waits"
 
 @dataclass(frozen=True)
 class Schedule:
-    """Tasks that a run must make.
+    """Tasks that a run must make, every one after its inputs.
 
-    Attributes
-    ----------
-    todo : tasks to make, every one after its inputs
-    damaged : tasks whose product is damaged; they are in `todo`
-    again : keys of intact products of other code that are made again; their tasks are in `todo`
+    Among them are those with damaged products, and those of intact products of other code, by key, that are made
+    `again`.
     """
 
     todo: tuple[Task, ...]
@@ -229,12 +226,9 @@ class Schedule:
 class Budget:
     """Resources of a run.
 
-    Attributes
-    ----------
-    workers : number of worker processes, or None for one per core within the memory
-    max_memory : memory of all workers together, such as "6 GB", or None for all free memory
-    scheduler : address of a running dask scheduler, whose memory is not checked, or None
-    strict : if true, products of other code or other versions of packages are made again, which need memory as well
+    Without a number of workers there is one for each core within the memory; `max_memory` of all workers together is
+    such as "6 GB", by default all that is free. The memory of a running dask scheduler, given by its address, is not
+    checked. A `strict` run also makes products of other code or other versions of packages again.
     """
 
     workers: int | None = None

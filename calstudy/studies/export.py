@@ -51,13 +51,8 @@ def export(
 ) -> list[Path]:
     """Write the data of every world, make products that are missing in the store, and return the folders.
 
-    Raises InputError as `folders_of` does, or if the data cannot be made.
-
-    Parameters
-    ----------
-    worlds : from `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`
-    folder : that of a single world; several worlds have subfolders ``world-1`` and so on
-    file_format : one of `FORMATS`
+    The worlds are from `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`; several have
+    subfolders ``world-1`` and so on. Raises InputError as `folders_of` does, or if the data cannot be made.
     """
     folders = folders_of(worlds, folder, file_format, overwrite)
     fits = [fit(case.experiment, budget, lambda wanted: WorldData.of(wanted).tasks) for case in worlds.cases]

@@ -199,11 +199,8 @@ def standings(
 ) -> list[InBand]:
     """Return the verdict on every calibrator in every band of k, band by band.
 
-    Parameters
-    ----------
-    scores : the content of comparison.json: scores by world and calibrator
-    refusals : world, calibrator and reason of those that cannot work
-    limit : largest tolerated bias, over the EoR
+    Scores are by world and calibrator, as in comparison.json; refusals are world, calibrator and reason of those that
+    cannot work. The limit is the largest tolerated bias, over the EoR.
     """
     found: dict[tuple[tuple[float, float], str], list[InWorld]] = {}
     refused = dict.fromkeys((world, calibrator) for world, calibrator, _ in refusals if world in scores)

@@ -207,18 +207,12 @@ class Comparison(Family):
 
     @classmethod
     def load(cls, file: StudyFile, calibrators: Mapping[str, Any] | None = None) -> Comparison:
-        """Return the comparison of a file.
+        """Return the comparison of a file, perhaps with other calibrators.
 
-        Raises InputError if a file cannot be read, or a scale or override cannot be applied, and ExperimentError if
-        fields are unknown, missing, or have values that are not allowed.
-
-        Parameters
-        ----------
-        file
-            Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
-            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all
-            others are applied to the experiment of every case.
-        calibrators : in place of those of the file
+        Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
+        `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
+        applied to the experiment of every case. Raises InputError if a file cannot be read, or a scale or override
+        cannot be applied, and ExperimentError if fields are unknown, missing, or have values that are not allowed.
         """
         content, base, overrides, worlds = _read(file, calibrators)
         members = _experiments(content, worlds, base, lambda data: validate(data, file.folder))
@@ -395,13 +389,9 @@ def load_worlds(
 ) -> Comparison:
     """Return calibrators in the worlds of a comparison, or in the one of an experiment.
 
-    Raises InputError if the file is neither, or cannot be used.
-
-    Parameters
-    ----------
-    calibrators
-        Blocks `calibration` by label, in place of those of the file, with the assumptions of the experiment. None
-        for the file's own; that of an experiment has its own name as label.
+    `calibrators` are blocks `calibration` by label, in place of those of the file, with the assumptions of the
+    experiment. None is for the file's own; that of an experiment has its own name as label. Raises InputError if the
+    file is neither, or cannot be used.
     """
     file = StudyFile.open(path, scale, overrides)
     kind = kind_of(file.content, file.folder)

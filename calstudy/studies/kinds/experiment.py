@@ -159,13 +159,8 @@ class ExperimentStudy(Study):
 class Family(Study):
     """Several experiments, and the figures, tables and claims of all of them.
 
-    Products that several members need have one key, and are made once. If members have their own run folders, they are
-    the `parts` of a family.
-
-    Attributes
-    ----------
-    file : content of the file
-    members : the experiments by label, all with the same store and folder of runs
+    Members are the experiments by label, all with the same store and folder of runs. Products that several members need
+    have one key, and are made once. If members have their own run folders, they are the `parts` of a family.
     """
 
     file: Any
