@@ -87,17 +87,6 @@ def defaults(section: type[BaseModel]) -> Mapping[str, Any]:
     return {name: field.get_default(call_default_factory=True) for name, field in section.model_fields.items()}
 
 
-def plain(value: Any) -> Any:
-    """Return nested settings as JSON-able values; sections with all their fields."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
 def alternatives(annotation: Any) -> list[Any]:
     """Return the plain types that a type allows, without Annotated and unions."""
     if get_origin(annotation) is Annotated:

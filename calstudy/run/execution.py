@@ -18,13 +18,14 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic_core import to_jsonable_python
+
 from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.quiet import errors_written_to, write_errors_to
 from calstudy.base.resources import Usage, cores, free_memory, parse_memory
-from calstudy.base.schema import plain
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
@@ -57,16 +58,14 @@ class WorkOrder:
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
         """Return the order for `task`; with `again`, its product is made even if it exists."""
-        own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
-        bare = task.given({name: name for name in inputs})
         return cls(
-            task=bare,
+            task=task.given({name: name for name in inputs}),
             key=task.key,
             inputs=inputs,
             store=store.root,
             again=again,
-            made_with=own,
+            made_with=made_with(task),
             content=task.content,
             disk=task.cost.disk,
         )
@@ -174,7 +173,7 @@ def _make(order: WorkOrder, store: Store) -> Product:
             "stage_version": task.stage.version,
             "key": order.key,
             "label": task.label,
-            "settings": plain(task.settings),
+            "settings": to_jsonable_python(task.settings),
             "inputs": order.inputs,
             "notes": notes,
             "temporary": task.temporary,

@@ -66,14 +66,19 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
 
 def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget) -> int:
     """Return how many workers fit into the memory, of those hoped for; raises InputError if not even one does."""
-    needs = {task: task.cost.memory for task in missing}
-    if not needs:
+    if not missing:
         return budget.workers or hoped
-    largest = max(needs, key=needs.__getitem__)
-    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
+    largest = max(missing, key=lambda task: task.cost.memory)
+    need, source = largest.cost.memory, "--max-memory leaves" if budget.max_memory else "this machine has"
+    if need > memory:
+        more = "give it more with --max-memory, or " if need < total_memory() else ""
+        raise InputError(
+            f"{source} {max(memory, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
+            f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
+        )
     if budget.workers is not None and budget.max_memory is None:
         return budget.workers
-    return min(hoped, max(1, int(memory // needs[largest])))
+    return min(hoped, max(1, int(memory // need)))
 
 
 def _require_sane(budget: Budget) -> None:
@@ -83,15 +88,6 @@ def _require_sane(budget: Budget) -> None:
         raise InputError(
             f"--workers {budget.workers}: at most {most} are allowed on this machine, which has {cores()} processor "
             "core(s); leave it out for one per core"
-        )
-
-
-def _require_room(largest: Task, need: float, budget: float, source: str) -> None:
-    if need > budget:
-        more = "give it more with --max-memory, or " if need < total_memory() else ""
-        raise InputError(
-            f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
-            f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
         )
 
 
