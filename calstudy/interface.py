@@ -48,7 +48,7 @@ from calstudy.products.files import (
 from calstudy.products.gain_errors import ERRORS
 from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
-from calstudy.results.reader import EXPERIMENT, RunFolder, Tables, by_length_and_delay, by_wavenumber, gain_errors
+from calstudy.results.reader import EXPERIMENT, RunFolder, by_length_and_delay, by_wavenumber, gain_errors
 from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
@@ -361,29 +361,29 @@ class OpenRun:
     @property
     def cylindrical(self) -> ByVariant:
         """Cylindrical power spectra, by variant: datasets with `power` against `baseline_length` and `delay`."""
-        return self._by_variant(lambda name: by_length_and_delay(self._tables.wedge(name)))
+        return self._by_variant(lambda name: by_length_and_delay(self._folder.tables.wedge(name)))
 
     @property
     def transfer(self) -> xarray.Dataset:
         """The transfer function T of the calibration against `region` ("outside-wedge", "inside-wedge") and `k`."""
-        return self._by_region(self._tables.transfer)
+        return self._by_region(self._folder.tables.transfer)
 
     @property
     def transfer_in_bands(self) -> xarray.Dataset:
         """The same in four wide bands of k."""
-        return self._by_region(self._tables.transfer_in_bands)
+        return self._by_region(self._folder.tables.transfer_in_bands)
 
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        return by_length_and_delay(self._tables.transfer_map())
+        return by_length_and_delay(self._folder.tables.transfer_map())
 
     @property
     def scores(self) -> pandas.DataFrame:
         """T and bias of the calibration in bands of k, with errors from leaving out antennas; one row for each band."""
         import pandas
 
-        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._tables.summary["bands"]]
+        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._folder.tables.summary["bands"]]
         return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
 
     def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> pandas.DataFrame:
@@ -394,7 +394,8 @@ class OpenRun:
         """
         import pandas
 
-        self._tables.path(COMPARISON, "the run is no comparison, and has no standings; `scores` has its T and bias")
+        missing = "the run is no comparison, and has no standings; `scores` has its T and bias"
+        self._folder.tables.path(COMPARISON, missing)
         if not limit > 0:
             raise InputError(f"limit = {limit!r}: must be greater than 0, in units of the power of the EoR")
         found = self._folder.standings(limit, worlds)
@@ -440,7 +441,7 @@ class OpenRun:
         import pandas
 
         listed = f"{nearest(name, self.tables)} (there are: {', '.join(self.tables)})"
-        return pandas.read_csv(self._tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}"))
+        return pandas.read_csv(self._folder.tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}"))
 
     @property
     def parts(self) -> dict[str, OpenRun]:
@@ -504,21 +505,13 @@ class OpenRun:
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
-        finished = self._manifest.get("finished", "at an unknown time")
+        finished = self._folder.manifest.get("finished", "at an unknown time")
         lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
-        setup = [self._manifest["setup"]] if "setup" in self._manifest else []
+        setup = [self._folder.manifest["setup"]] if "setup" in self._folder.manifest else []
         return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"
-
-    @property
-    def _manifest(self) -> Mapping[str, Any]:
-        return self._folder.manifest
-
-    @property
-    def _tables(self) -> Tables:
-        return self._folder.tables
 
     @cached_property
     def _study(self) -> Study:
@@ -526,7 +519,7 @@ class OpenRun:
             return load_study(self.folder / EXPERIMENT)
         except ExperimentError as error:
             # The version that wrote the file accepted it.
-            commit = self._manifest.get("git_commit")
+            commit = self._folder.manifest.get("git_commit")
             writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
             raise InputError(
                 f"{self.folder / EXPERIMENT}: written on {self._folder.finished:%d %B %Y} by {writer}; this version "
@@ -538,10 +531,10 @@ class OpenRun:
         return _single(self._study)
 
     def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
-        return ByVariant(self._tables.variants, read)
+        return ByVariant(self._folder.tables.variants, read)
 
     def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
-        return lambda name: by_wavenumber(self._tables.spherical(name, modes))
+        return lambda name: by_wavenumber(self._folder.tables.spherical(name, modes))
 
     def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
         import xarray
