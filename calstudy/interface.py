@@ -95,7 +95,7 @@ def _typed(function: Callable[P, R]) -> Callable[P, R]:
 
 @_typed
 def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
-    """Load a study.
+    """Load a study; raises InputError if the file cannot be read, or a field is unknown or has a wrong value.
 
     Parameters
     ----------
@@ -107,11 +107,6 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
     **changes
         Fields that are changed, by dotted path: ``**{"instrument.times.count": 8}``. Values are those that the file
         could have: numbers, texts with units, lists and mappings.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a field is unknown or has a value that is not allowed.
     """
     texts = _overrides(changes)
     if isinstance(source, Mapping):
@@ -137,6 +132,9 @@ def calibrate_data(
 ) -> CalibratedData:
     """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
 
+    Raises InputError if the data cannot be used, a field is unknown or has a value that is not allowed, or the folder
+    has results.
+
     Parameters
     ----------
     data
@@ -154,11 +152,6 @@ def calibrate_data(
         ``--gain-error-realizations``, for calibrators whose gains have no errors of their own.
     **changes
         Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
-
-    Raises
-    ------
-    InputError
-        If the data cannot be used, a field is unknown or has a value that is not allowed, or the folder has results.
     """
     from rich.console import Console
 

@@ -171,9 +171,7 @@ def _without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
     """Run the study of a reference folder with ``path=value`` overrides, and return the run's folder.
 
-    Products of other code are made again.
-
-    Raise InputError if the experiment is a sweep, or as the run raises it.
+    Products of other code are made again. Raise InputError if the experiment is a sweep, or as the run raises it.
     """
     study = load_study(reference / EXPERIMENT, None, overrides)
     if not study.has_reference:
