@@ -13,7 +13,7 @@ import yaml
 from pydantic import ValidationError
 from rich.console import Console
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.files import replacing
 from calstudy.base.table import Table
 from calstudy.experiment.model import FIGURES
@@ -124,7 +124,7 @@ def accept(run: Path, reference: Path) -> None:
         description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     except (OSError, ValueError) as error:
         raise InputError(f"{run}: cannot be read ({error})") from None
-    try:
+    with errors_of_files(f"{reference}: cannot be written"):
         (reference / "tables").mkdir(parents=True, exist_ok=True)
         kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
         kept += [*(reference / name for name in (*CLAIMS_FILES, *TABLES)), *(reference / "tables").iterdir()]
@@ -136,8 +136,6 @@ def accept(run: Path, reference: Path) -> None:
                 stream.write(content)
         if not listed:
             (reference / "tables").rmdir()
-    except OSError as error:
-        raise InputError(f"{reference}: cannot be written ({error.strerror})") from None
 
 
 def _experiment(run: Path) -> dict[str, Any]:
@@ -393,10 +391,8 @@ def write_json(regression: Regression, folder: Path) -> Path:
     """Write ``regression.json`` into a folder; raise InputError if it cannot be written."""
     path = folder / REGRESSION_JSON
     text = json.dumps({**asdict(regression), "holds": regression.holds}, indent=1, ensure_ascii=False)
-    try:
+    with errors_of_files(f"{path}: cannot be written"):
         path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
     return path
 
 

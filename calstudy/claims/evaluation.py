@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import Cost
 from calstudy.base.user_code import without_code_of_files
@@ -192,12 +192,10 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
         found, by_solver = _evaluated(run, named)
-    try:
+    with errors_of_files(f"{folder}: the claims cannot be written"):
         write_claims(found.verdicts, folder, run.name, run.manifest["stand_ins"], found.without_role)
         if by_solver:
             write_claims_by_solver(by_solver, folder, run.name, run.manifest["stand_ins"])
-    except OSError as error:
-        raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
     return found
 
 
