@@ -48,7 +48,7 @@ from calstudy.products.files import (
 from calstudy.products.gain_errors import ERRORS
 from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
-from calstudy.results.reader import EXPERIMENT, RunFolder, Tables, by_length_and_delay, by_wavenumber, gain_errors
+from calstudy.results.reader import EXPERIMENT, RunFolder, by_length_and_delay, by_wavenumber, gain_errors
 from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
@@ -95,7 +95,7 @@ def _typed(function: Callable[P, R]) -> Callable[P, R]:
 
 @_typed
 def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
-    """Load a study.
+    """Load a study; raises InputError if the file cannot be read, or a field is unknown or has a wrong value.
 
     Parameters
     ----------
@@ -107,11 +107,6 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
     **changes
         Fields that are changed, by dotted path: ``**{"instrument.times.count": 8}``. Values are those that the file
         could have: numbers, texts with units, lists and mappings.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a field is unknown or has a value that is not allowed.
     """
     texts = _overrides(changes)
     if isinstance(source, Mapping):
@@ -137,6 +132,9 @@ def calibrate_data(
 ) -> CalibratedData:
     """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
 
+    Raises InputError if the data cannot be used, a field is unknown or has a value that is not allowed, or the folder
+    has results.
+
     Parameters
     ----------
     data
@@ -154,11 +152,6 @@ def calibrate_data(
         ``--gain-error-realizations``, for calibrators whose gains have no errors of their own.
     **changes
         Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
-
-    Raises
-    ------
-    InputError
-        If the data cannot be used, a field is unknown or has a value that is not allowed, or the folder has results.
     """
     from rich.console import Console
 
@@ -275,12 +268,8 @@ class LoadedStudy:
     def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
         """Return the stages of a run with the estimated time, memory and disk.
 
-        Parameters
-        ----------
-        workers
-            Number of worker processes; by default one for each core, as far as the memory allows.
-        max_memory
-            Memory of all workers together, such as "6 GB"; by default all free memory.
+        By default there is a worker process for each core, as far as the memory allows. `max_memory` is that of all
+        workers together, such as "6 GB"; by default all free memory.
         """
         return StudyPlan(describe_plan(self._study, Budget(workers, max_memory)))
 
@@ -291,16 +280,9 @@ class LoadedStudy:
         scheduler: str | None = None,
         quiet: bool = False,
     ) -> OpenRun:
-        """Make all products that are not in the store, and fill the run folder.
+        """Make all products that are not in the store, and fill the run folder; if `quiet`, without printed progress.
 
-        Parameters
-        ----------
-        workers, max_memory
-            As for `plan`.
-        scheduler
-            Address of a running dask scheduler, in place of own workers.
-        quiet
-            If true, no progress is printed.
+        Workers and memory are as for `plan`; `scheduler` is the address of a running dask scheduler in place of them.
         """
         from rich.console import Console
 
@@ -372,29 +354,29 @@ class OpenRun:
     @property
     def cylindrical(self) -> ByVariant:
         """Cylindrical power spectra, by variant: datasets with `power` against `baseline_length` and `delay`."""
-        return self._by_variant(lambda name: by_length_and_delay(self._tables.wedge(name)))
+        return self._by_variant(lambda name: by_length_and_delay(self._folder.tables.wedge(name)))
 
     @property
     def transfer(self) -> xarray.Dataset:
         """The transfer function T of the calibration against `region` ("outside-wedge", "inside-wedge") and `k`."""
-        return self._by_region(self._tables.transfer)
+        return self._by_region(self._folder.tables.transfer)
 
     @property
     def transfer_in_bands(self) -> xarray.Dataset:
         """The same in four wide bands of k."""
-        return self._by_region(self._tables.transfer_in_bands)
+        return self._by_region(self._folder.tables.transfer_in_bands)
 
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        return by_length_and_delay(self._tables.transfer_map())
+        return by_length_and_delay(self._folder.tables.transfer_map())
 
     @property
     def scores(self) -> pandas.DataFrame:
         """T and bias of the calibration in bands of k, with errors from leaving out antennas; one row for each band."""
         import pandas
 
-        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._tables.summary["bands"]]
+        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._folder.tables.summary["bands"]]
         return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
 
     def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> pandas.DataFrame:
@@ -405,7 +387,8 @@ class OpenRun:
         """
         import pandas
 
-        self._tables.path(COMPARISON, "the run is no comparison, and has no standings; `scores` has its T and bias")
+        missing = "the run is no comparison, and has no standings; `scores` has its T and bias"
+        self._folder.tables.path(COMPARISON, missing)
         if not limit > 0:
             raise InputError(f"limit = {limit!r}: must be greater than 0, in units of the power of the EoR")
         found = self._folder.standings(limit, worlds)
@@ -451,7 +434,7 @@ class OpenRun:
         import pandas
 
         listed = f"{nearest(name, self.tables)} (there are: {', '.join(self.tables)})"
-        return pandas.read_csv(self._tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}"))
+        return pandas.read_csv(self._folder.tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}"))
 
     @property
     def parts(self) -> dict[str, OpenRun]:
@@ -459,15 +442,7 @@ class OpenRun:
         return {name: OpenRun(folder) for name, folder in self._folder.parts.items()}
 
     def gains(self, variant: str = "residual", half: Half = "even") -> UVCal:
-        """Return the gains of the calibration of a variant; "true" in place of a variant returns the true gains.
-
-        Parameters
-        ----------
-        variant
-            A calibrated variant.
-        half
-            Which of the two noise realizations.
-        """
+        """Return the gains of a calibrated variant, of one of the two noise realizations, or the "true" gains."""
         from pyuvdata import UVCal
 
         study = self._experiment
@@ -477,17 +452,8 @@ class OpenRun:
     def gain_errors(self, variant: str = "residual", half: Half = "even") -> xarray.Dataset:
         """Compute standard deviations of gains by noise, `amplitude` and `phase`, from the products in the store.
 
-        Parameters
-        ----------
-        variant
-            A calibrated variant.
-        half
-            Which of the two noise realizations.
-
-        Raises
-        ------
-        InputError
-            If they are not known for the calibrator or the size of the array, with the reason.
+        Variant and half are as for `gains`. Raises InputError, with the reason, if the errors are not known for the
+        calibrator or the size of the array.
         """
         self._calibration(variant, half)
         study = self._experiment
@@ -501,14 +467,9 @@ class OpenRun:
             return gain_errors(Path(folder) / GAINS)
 
     def visibilities(self, variant: str, half: Half = "even") -> UVData:
-        """Return the visibilities of a variant: the residual if it is calibrated, else the simulated data.
+        """Return the visibilities of a variant, such as "uncalibrated", of one of the two noise realizations.
 
-        Parameters
-        ----------
-        variant
-            A variant, such as "uncalibrated".
-        half
-            Which of the two noise realizations.
+        These are the residual if the variant is calibrated, else the simulated data.
         """
         study = self._experiment
         if self._variant(variant).calibrate:
@@ -537,21 +498,13 @@ class OpenRun:
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
-        finished = self._manifest.get("finished", "at an unknown time")
+        finished = self._folder.manifest.get("finished", "at an unknown time")
         lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
-        setup = [self._manifest["setup"]] if "setup" in self._manifest else []
+        setup = [self._folder.manifest["setup"]] if "setup" in self._folder.manifest else []
         return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"
-
-    @property
-    def _manifest(self) -> Mapping[str, Any]:
-        return self._folder.manifest
-
-    @property
-    def _tables(self) -> Tables:
-        return self._folder.tables
 
     @cached_property
     def _study(self) -> Study:
@@ -559,7 +512,7 @@ class OpenRun:
             return load_study(self.folder / EXPERIMENT)
         except ExperimentError as error:
             # The version that wrote the file accepted it.
-            commit = self._manifest.get("git_commit")
+            commit = self._folder.manifest.get("git_commit")
             writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
             raise InputError(
                 f"{self.folder / EXPERIMENT}: written on {self._folder.finished:%d %B %Y} by {writer}; this version "
@@ -571,10 +524,10 @@ class OpenRun:
         return _single(self._study)
 
     def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
-        return ByVariant(self._tables.variants, read)
+        return ByVariant(self._folder.tables.variants, read)
 
     def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
-        return lambda name: by_wavenumber(self._tables.spherical(name, modes))
+        return lambda name: by_wavenumber(self._folder.tables.spherical(name, modes))
 
     def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
         import xarray

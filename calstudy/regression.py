@@ -13,7 +13,7 @@ import yaml
 from pydantic import ValidationError
 from rich.console import Console
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.files import replacing
 from calstudy.base.table import Table
 from calstudy.experiment.model import FIGURES
@@ -23,7 +23,7 @@ from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_FILES, count
-from calstudy.verdicts.tolerances import ROUNDING, Arrays, Drawn, Fixed, Measured, Rules, tolerance
+from calstudy.verdicts.tolerances import ROUNDING, Arrays, Drawn, Fixed, Measured, Rules, Tolerance, tolerance
 
 KEPT = ("png", "npz")
 """Endings of the kept files of a figure: the picture and its arrays."""
@@ -124,7 +124,7 @@ def accept(run: Path, reference: Path) -> None:
         description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
     except (OSError, ValueError) as error:
         raise InputError(f"{run}: cannot be read ({error})") from None
-    try:
+    with errors_of_files(f"{reference}: cannot be written"):
         (reference / "tables").mkdir(parents=True, exist_ok=True)
         kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
         kept += [*(reference / name for name in (*CLAIMS_FILES, *TABLES)), *(reference / "tables").iterdir()]
@@ -136,8 +136,6 @@ def accept(run: Path, reference: Path) -> None:
                 stream.write(content)
         if not listed:
             (reference / "tables").rmdir()
-    except OSError as error:
-        raise InputError(f"{reference}: cannot be written ({error.strerror})") from None
 
 
 def _experiment(run: Path) -> dict[str, Any]:
@@ -171,9 +169,7 @@ def _without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
     """Run the study of a reference folder with ``path=value`` overrides, and return the run's folder.
 
-    Products of other code are made again.
-
-    Raise InputError if the experiment is a sweep, or as the run raises it.
+    Products of other code are made again. Raise InputError if the experiment is a sweep, or as the run raises it.
     """
     study = load_study(reference / EXPERIMENT, None, overrides)
     if not study.has_reference:
@@ -199,12 +195,12 @@ class ArrayComparison:
     figure: str
     name: str
     status: Status
-    relative: float | None
-    largest: float | None
-    rms: float | None
-    shift: float | None
-    tolerance: str
-    why: str
+    relative: float | None = None
+    largest: float | None = None
+    rms: float | None = None
+    shift: float | None = None
+    tolerance: str = ""
+    why: str = ""
     problem: str = ""
 
 
@@ -216,9 +212,9 @@ class ClaimComparison:
     status: Status
     reference_verdict: str
     verdict: str
-    reference: float | None
-    measured: float | None
-    sigmas: float | None
+    reference: float | None = None
+    measured: float | None = None
+    sigmas: float | None = None
 
 
 def rules_of(figure: str, declared: Mapping[str, Rules] | None = None) -> Rules:
@@ -247,17 +243,18 @@ def compare_figures(
         old, new, rules = reference.get(figure, {}), made.get(figure, {}), rules_of(figure, declared)
         for name in dict.fromkeys([*old, *new]):
             if name not in new:
-                anything = isinstance(tolerance(rules, name, old), Measured)
-                found.append(_without_numbers(figure, name, "moved" if anything else "beyond", "missing"))
+                found.append(ArrayComparison(figure, name, _worst(tolerance(rules, name, old)), problem="missing"))
             elif name not in old:
-                found.append(_without_numbers(figure, name, "moved", "new, the reference does not have it"))
+                problem = "new, the reference does not have it"
+                found.append(ArrayComparison(figure, name, "moved", problem=problem))
             else:
                 found.append(compare_array(figure, name, old, new[name], rules))
     return found
 
 
-def _without_numbers(figure: str, name: str, status: Status, problem: str) -> ArrayComparison:
-    return ArrayComparison(figure, name, status, None, None, None, None, "", "", problem)
+def _worst(rule: Tolerance) -> Status:
+    """Return the status of what differs by anything."""
+    return "moved" if isinstance(rule, Measured) else "beyond"
 
 
 def compare_array(
@@ -269,16 +266,15 @@ def compare_array(
     """
     old = reference[name]
     rule = tolerance(rules_of(figure) if rules is None else rules, name, reference)
-    anything = isinstance(rule, Measured)
     if old.shape != made.shape:
-        return _without_numbers(figure, name, "moved" if anything else "beyond", f"shape {made.shape}, was {old.shape}")
+        return ArrayComparison(figure, name, _worst(rule), problem=f"shape {made.shape}, was {old.shape}")
     if old.dtype.kind not in "fc" or made.dtype.kind not in "fc":
         equal = np.array_equal(old, made)
+        status: Status = "same" if equal else _worst(rule)
         problem = "" if equal else "different"
-        status: Status = "same" if equal else "moved" if anything else "beyond"
-        return ArrayComparison(figure, name, status, None, None, None, None, "equal", rule.why, problem)
+        return ArrayComparison(figure, name, status, tolerance="equal", why=rule.why, problem=problem)
     if not _same_where_not_finite(old, made):
-        return _without_numbers(figure, name, "moved" if anything else "beyond", "finite in other places, or not alike")
+        return ArrayComparison(figure, name, _worst(rule), problem="finite in other places, or not alike")
     relative = _relative(old, made)
     deviations = _deviations(rule, reference, name, made) if isinstance(rule, Drawn) else None
     if relative <= ROUNDING and (deviations is None or deviations[0] <= ROUNDING):
@@ -349,12 +345,12 @@ def _compare_claim(name: str, old: Verdict | None, new: Verdict | None, on_machi
     if old is None or new is None:
         status: Status = "moved" if old is None or old.measured is None else "beyond"
         verdicts = (old.verdict if old else "new", new.verdict if new else "missing")
-        return ClaimComparison(name, status, *verdicts, None, None, None)
+        return ClaimComparison(name, status, *verdicts)
     before, after = old.measured, new.measured
     if before is None or after is None:
         evaluated: Status = "moved" if on_machines and after is not None else "beyond"
         status = "same" if old.verdict == new.verdict else evaluated
-        return ClaimComparison(name, status, old.verdict, new.verdict, before, after, None)
+        return ClaimComparison(name, status, old.verdict, new.verdict, before, after)
     difference = abs(after - before)
     sigmas = difference / old.uncertainty if old.uncertainty else None
     if old.verdict != new.verdict:
@@ -395,10 +391,8 @@ def write_json(regression: Regression, folder: Path) -> Path:
     """Write ``regression.json`` into a folder; raise InputError if it cannot be written."""
     path = folder / REGRESSION_JSON
     text = json.dumps({**asdict(regression), "holds": regression.holds}, indent=1, ensure_ascii=False)
-    try:
+    with errors_of_files(f"{path}: cannot be written"):
         path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
     return path
 
 

@@ -6,6 +6,8 @@ import difflib
 import errno
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 REFUSALS = (
     errno.ENOSPC,
@@ -51,6 +53,15 @@ def exit_status(error: BaseException | None) -> int:
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     return 0 if error is None else next(status for kind, status in kinds.items() if isinstance(error, kind))
+
+
+@contextmanager
+def errors_of_files(sentence: str) -> Iterator[None]:
+    """Raise InputError, with a sentence and the reason, for an OSError in the block."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{sentence} ({error.strerror})") from None
 
 
 def refusal_of_disk(error: OSError | RuntimeError) -> str | None:

@@ -48,13 +48,9 @@ def at_common_channels(first: UVCal, second: UVCal) -> tuple[UVCal, UVCal]:
 def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = None) -> UVCal:
     """Return gains as UVCal, for all antennas of the template's telescope and the feeds of its polarizations.
 
-    Parameters
-    ----------
-    template : gives telescope, channels, polarizations (xx, yy) and times
-    gains
-        Complex, (Nants_telescope, Nfreqs, Ntimes, Npols) in the order of `telescope.antenna_numbers`. Ntimes is
-        the template's, or 1 for gains that are constant during the run.
-    flags : boolean of the same shape; none flagged by default
+    `gains` are complex, (Nants_telescope, Nfreqs, Ntimes, Npols) in the order of `telescope.antenna_numbers`. Ntimes is
+    the template's, or 1 for gains that are constant during the run. `flags` have the same shape; by default none is
+    set.
     """
     from pyuvdata import UVCal
 
@@ -176,12 +172,9 @@ def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
     """Return the gains of the antennas of the template's baselines, at its channels and polarizations.
 
-    Raises InputError if `cal` has delays, or lacks an antenna, a channel or a polarization of the template.
-
-    Returns
-    -------
-    (Nants, Nfreqs, Ntimes of `cal`, Npols) complex128
-        By ascending number of the antennas and in the convention "divide"; NaN where they are flagged.
+    They are complex128, (Nants, Nfreqs, Ntimes of `cal`, Npols), by ascending number of the antennas and in the
+    convention "divide"; NaN where they are flagged. Raises InputError if `cal` has delays, or lacks an antenna, a
+    channel or a polarization of the template.
     """
     numbers = np.unique(antenna_pairs(template))
     require_solutions(cal, numbers, template.freq_array, np.min(template.channel_width))

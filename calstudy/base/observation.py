@@ -23,14 +23,10 @@ class Frame:
 
     Parameters
     ----------
-    numbers : (Nants,) int
-        Number of each antenna that is in a baseline, ascending.
-    positions : (Nants, 3) float
-        Antenna positions, east, north, up, m.
-    antennas : (Nbls, 2) int
-        The two antennas (a, b) of each baseline as indices into `numbers`.
-    frequencies : (Nfreqs,) float
-        Channel centres, Hz.
+    numbers : number of each antenna that is in a baseline, ascending, (Nants,) int
+    positions : antenna positions, east, north, up, m, (Nants, 3)
+    antennas : the two antennas (a, b) of each baseline as indices into `numbers`, (Nbls, 2) int
+    frequencies : channel centres, Hz, (Nfreqs,)
     n_times, n_polarizations : numbers of integrations and polarizations
     """
 
@@ -107,20 +103,14 @@ class Frame:
 class Observation(Frame):
     """Visibilities of every baseline at every time, with their antennas, baselines and channels.
 
-    Raises InputError if the visibilities are not rectangular.
-
-    Parameters
-    ----------
-    uvd
-        Rectangular and time-major: all baselines of the first integration, then of the second, and so on. It is not
-        copied, and must not be changed afterwards. It may be without data; then there are no visibilities.
+    They are of a UVData, rectangular and time-major: all baselines of the first integration, then of the second, and so
+    on. It is not copied, and must not be changed afterwards. It may be without data; then there are no visibilities.
+    Raises InputError if it is not rectangular.
 
     Attributes
     ----------
-    times : (Ntimes,) float
-        Julian date of each integration.
-    polarizations : (Npols,) int
-        AIPS numbers, such as -5 for XX.
+    times : Julian date of each integration, (Ntimes,)
+    polarizations : AIPS numbers, such as -5 for XX, (Npols,)
     """
 
     def __init__(self, uvd: UVData) -> None:

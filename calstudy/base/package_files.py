@@ -108,16 +108,10 @@ REPOSITORY = (
 
 @dataclass(frozen=True)
 class MwaFile:
-    """A data file of mwa_pb 1.1.
+    """A data file of mwa_pb 1.1, `packaged` or from `url`, where it must have the same SHA-256.
 
-    Attributes
-    ----------
-    packaged : the file in the package
-    content : what it is, for messages
-    fetched_as : its name for ``calstudy data fetch``
-    url : a source besides the package
-    sha256 : of the file in mwa_pb 1.1, which that at the source must have
-    instead : what can be done without it, for messages
+    `content` and `instead` are for messages: what it is, and what can be done without it. `fetched_as` is its name for
+    ``calstudy data fetch``.
     """
 
     packaged: PackageFile
@@ -133,14 +127,9 @@ class MwaFile:
         return Path(self.packaged.name).name
 
     def fetch(self, directory: Path | None = None, progress: bool = True) -> Path:
-        """Download the file, or verify an existing copy.
+        """Download the file, or verify an existing copy; the directory is by default `default_directory`.
 
         Raises InputError if the download fails or is not the file.
-
-        Parameters
-        ----------
-        directory : where to put it, `calstudy.base.package_files.default_directory` by default; made if need be
-        progress : whether to show a progress bar
         """
         path = (default_directory() if directory is None else directory) / self.name
         download(self.url, path, f"install mwa_pb 1.1, or {self.instead}", known_hash=self.sha256, progress=progress)

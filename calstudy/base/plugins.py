@@ -32,13 +32,8 @@ FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]
 class Plugin(Section):
     """The base class of all plug-ins. Subclasses declare settings as fields, and behaviour as methods.
 
-    Attributes
-    ----------
-    registry
-        The kind of plug-in; set by the base class of each kind.
-    version
-        Version of a built-in plug-in, increased whenever its results change, so that the products that depend on it are
-        made again.
+    The base class of each kind sets the `registry`. The version of a built-in plug-in is increased whenever its results
+    change, so that the products that depend on it are made again.
     """
 
     registry: ClassVar[Registry]
@@ -95,17 +90,10 @@ P = TypeVar("P", bound=Plugin)
 class Registry(Kinds[P]):
     """All plug-ins of one kind: the built-in ones, those of installed packages, and those in files.
 
-    Parameters
-    ----------
-    noun : name of the kind, such as "calibrator"
-    package
-        Package whose modules contain the built-in ones; module `sky_based` contains ``sky-based``. Modules whose name
-        starts with an underscore contain none.
-    base_path : ``module:class`` of the base class of the kind
-    tag : the field of an experiment file that contains the name
-    families
-        Whether a module may have several classes or none, and a class several names (`Plugin.names`). Names that are
-        defaults of the tag are read from the text of the modules, without importing them.
+    The `noun` names the kind, such as "calibrator", and `base_path` is ``module:class`` of its base class. The built-in
+    ones are in the modules of `package`; module `sky_based` contains ``sky-based``, and modules whose name starts with
+    an underscore contain none. With `families`, a module may have several classes or none, and a class several names
+    (`Plugin.names`); names that are defaults of the tag are read from the text of the modules, without importing them.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:

@@ -87,17 +87,6 @@ def defaults(section: type[BaseModel]) -> Mapping[str, Any]:
     return {name: field.get_default(call_default_factory=True) for name, field in section.model_fields.items()}
 
 
-def plain(value: Any) -> Any:
-    """Return nested settings as JSON-able values; sections with all their fields."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
 def alternatives(annotation: Any) -> list[Any]:
     """Return the plain types that a type allows, without Annotated and unions."""
     if get_origin(annotation) is Annotated:
@@ -172,15 +161,11 @@ class Kinds(Generic[S]):
         return [name for name in self.built_in() if key in self.find(name).model_fields]
 
     def make(self, block: Any, default: str | None = None, **context: Any) -> S:
-        """Return the section that a block of settings describes.
+        """Return the section that a name, a path or a block of settings describes; a section or word is unchanged.
 
-        Raises pydantic.ValidationError if the settings are invalid, and InputError if there is no such kind.
-
-        Parameters
-        ----------
-        block : a name or path, a block of settings with the tag, or a section or word, which is returned unchanged
-        default : name for a block without the tag
-        context : of the validation: `folder` is where relative paths of files start; the working directory without it
+        A block without the tag is of the kind `default`. Relative paths of files start at the `folder` of the context
+        of the validation, or at the working directory. Raises pydantic.ValidationError if the settings are invalid, and
+        InputError if there is no such kind.
         """
         if isinstance(block, self.base) or block in self.words:
             return block

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.plugins import guarded
 from calstudy.base.resources import Cost
 from calstudy.base.user_code import without_code_of_files
@@ -182,26 +182,20 @@ INSTEAD = "use --run-code if you trust who wrote the folder, or, if it is a pape
 def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> Evaluation:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
-    If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too.
-    Raises InputError if it is neither, names no paper or code that may not be run, or cannot be written.
-
-    Parameters
-    ----------
-    folder : of a run (``experiment.yaml``, ``tables/``), or of a collection, whose members' folders are beside it
-    papers : names of papers, or files, in place of those that the run names
-    run_code : whether Python files in the folder's experiments may be run; those of `papers` always are
+    The folder is that of a run, or of a collection, whose members' folders are beside it. If members differ only in the
+    paper's own solver, claims-by-solver.json and .md are written too. `papers` are names or files in place of those
+    that the run names. Python files of these are always run, those of the folder's experiments only with `run_code`.
+    Raises InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
     """
     run = RunFolder(folder)
     _require_evaluable(run)
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
         found, by_solver = _evaluated(run, named)
-    try:
+    with errors_of_files(f"{folder}: the claims cannot be written"):
         write_claims(found.verdicts, folder, run.name, run.manifest["stand_ins"], found.without_role)
         if by_solver:
             write_claims_by_solver(by_solver, folder, run.name, run.manifest["stand_ins"])
-    except OSError as error:
-        raise InputError(f"{folder}: the claims cannot be written ({error.strerror})") from None
     return found
 
 
@@ -279,52 +273,29 @@ class Evaluated(NamedTuple):
     tables: Mapping[str, Task]
 
 
-def claims(run: Evaluated, notes: Sequence[str]) -> Task | None:
-    """Return the task that evaluates the statements of an experiment's papers on it alone; None without papers.
-
-    The notes are its substitutions for the papers' ingredients.
-    """
-    experiment = run.experiment
-    if not experiment.papers:
-        return None
-    return Claims(
-        "claims",
-        papers=list(experiment.papers),
-        title=experiment.name,
-        notes=list(notes),
-        experiments={"": _facts(experiment)},
-        tables=_inputs_of({"": run}),
-    )
-
-
-def combined_claims(
-    title: str, runs: Mapping[str, Evaluated], papers: Sequence[Paper], roles: Mapping[str, str], notes: Sequence[str]
+def claims(
+    title: str,
+    papers: Sequence[Any],
+    runs: Mapping[str, Evaluated],
+    notes: Sequence[str],
+    roles: Mapping[str, str] | None = None,
 ) -> Task | None:
-    """Return the task that evaluates the statements of papers on several runs by role; None without papers.
+    """Return the task that evaluates the statements of papers on a run, or on several by role; None without papers.
 
-    The notes are the substitutions of all members for the papers' ingredients.
+    A single run has no name. The notes are the substitutions of all runs for the papers' ingredients.
     """
-    playing = {name: runs[name] for name in roles.values()}
     if not papers:
         return None
+    playing = runs if roles is None else {name: runs[name] for name in roles.values()}
     return Claims(
-        "claims of all",
+        "claims" if roles is None else "claims of all",
         papers=list(papers),
         title=title,
         notes=list(notes),
-        roles=dict(roles),
+        roles=None if roles is None else dict(roles),
         experiments={name: _facts(run.experiment) for name, run in playing.items()},
-        tables=_inputs_of(playing),
+        tables={f"{table}:{name}": task for name, run in playing.items() for table, task in run.tables.items()},
     )
-
-
-def _inputs_of(runs: Mapping[str, Evaluated]) -> dict[str, Task]:
-    return {f"{table}:{name}": task for name, run in runs.items() for table, task in run.tables.items()}
-
-
-def run_time_claims(title: str, papers: Sequence[Paper], run_times: Task) -> Task | None:
-    """Return the task that evaluates the statements of papers on a table of run times; None without papers."""
-    return RunTimeClaims("claims", papers=list(papers), title=title, runtime=run_times) if papers else None
 
 
 class Claims(Task, stage="claims", version=14, cost=Cost(1, disk=1e5)):

@@ -19,12 +19,9 @@ class Paper(Plugin):
 
     Attributes
     ----------
-    citation
-        Authors, year, title, identifier.
-    roles
-        Roles of runs in the paper's statements, with a description of the run in words that follow "needs".
-    usual_members
-        Name of the member of a collection that plays a role, unless its file names another.
+    citation : authors, year, title, identifier
+    roles : roles of runs in the paper's statements, with a description of the run in words that follow "needs"
+    usual_members : name of the member of a collection that plays a role, unless its file names another
     own_solver_roles
         For a role, the role of the run that differs only in its solver, which is the paper's own. If both are
         played, every statement is evaluated with either solver.

@@ -23,12 +23,8 @@ ARRAYS = "realizations.npz"
 class PooledResults:
     """All realizations of one experiment.
 
-    Attributes
-    ----------
-    experiment : with its realizations
-    arrays
-        Of the figure of the realizations, such as ``outside-wedge.values.bias`` (K, Nk) and ``outside-wedge.k``
-        (Nk,).
+    The arrays are those of the figure of the realizations, such as ``outside-wedge.values.bias`` (K, Nk) and
+    ``outside-wedge.k`` (Nk,).
     """
 
     experiment: Experiment
@@ -52,17 +48,11 @@ class PooledResults:
         return redundant_groups(enu[second] - enu[first], self.experiment.power.redundancy_tolerance).redundant_fraction
 
     def mean(self, quantity: str, modes: str, k_min: float = 0.0, k_max: float = np.inf) -> Finding:
-        """Return the mean of a quantity over bins of k and realizations.
+        """Return the mean of a quantity over bins of k, h/Mpc, and realizations.
 
-        Raises Unevaluated if there is no bin in which it is known in all realizations.
-
-        Parameters
-        ----------
-        quantity
-            Of `calstudy.power.realizations.QUANTITIES` or `TRANSFER_QUANTITIES`, or "eor" for P^S over the power
-            that the sky was drawn from.
-        modes : "outside-wedge", "inside-wedge" or "all-modes"
-        k_min, k_max : range of the bins, h/Mpc
+        It is one of `calstudy.power.realizations.QUANTITIES` or `TRANSFER_QUANTITIES`, or "eor" for P^S over the power
+        that the sky was drawn from; modes are "outside-wedge", "inside-wedge" or "all-modes". Raises Unevaluated if
+        there is no bin in which it is known in all realizations.
         """
         k, array = self.arrays[f"{modes}.k"], self.arrays.get(f"{modes}.values.{quantity}")
         if quantity == "eor":

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.cli.options import named_as_options
 
 if TYPE_CHECKING:
@@ -183,12 +183,10 @@ def write_schema(path: Path) -> None:
     """
     from calstudy.studies.reference import SCHEMA_TITLE, experiment_schema
 
-    try:
+    with errors_of_files(f"--schema {path}: cannot be written"):
         if path.exists() and SCHEMA_TITLE not in path.read_text(encoding="utf-8", errors="replace"):
             raise InputError(f"--schema {path}: is another file, and is not overwritten; choose another name")
         path.write_text(experiment_schema(), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--schema {path}: cannot be written ({error.strerror})") from None
     typer.echo(f"{path}")
 
 

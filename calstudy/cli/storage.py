@@ -85,7 +85,8 @@ def store(
     _show(chosen, folder, console)
     left = [item for item in leftovers(where) if item.age >= oldest]
     for item in left:
-        console.print(f"leftover of a run: {item.path}, {_size(item.size)}, {_days(item.age)}", markup=False)
+        age = f"{item.age / SECONDS['d']:.1f} d"
+        console.print(f"leftover of a run: {item.path}, {_size(item.size)}, {age}", markup=False)
     if not delete:
         return
     if older_than is not None:
@@ -140,10 +141,6 @@ def _show(chosen: list[Product], folder: Path, console: Console) -> None:
 
 def _size(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.2f} MB"
-
-
-def _days(seconds: float) -> str:
-    return f"{seconds / SECONDS['d']:.1f} d"
 
 
 def _age(text: str | None) -> float:

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import Field, ValidationError
+from pydantic_core import to_jsonable_python
 
 from calstudy.base.errors import ExperimentError
 from calstudy.base.paths import leaves, with_value
-from calstudy.base.schema import Section, plain
+from calstudy.base.schema import Section
 from calstudy.experiment.messages import sentences
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.settings import InstrumentSettings
@@ -83,7 +84,7 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
         return nominal
     content = nominal.model_dump(mode="json")
     for path, value in changes.items():
-        content = with_value(content, path, plain(value), lambda above, given: {})
+        content = with_value(content, path, to_jsonable_python(value), lambda above, given: {})
     try:
         world = AssumedWorld.model_validate(content, context={"folder": folder})
     except ValidationError as error:

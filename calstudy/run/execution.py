@@ -18,13 +18,14 @@ from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic_core import to_jsonable_python
+
 from calstudy import __version__
 from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.quiet import errors_written_to, write_errors_to
 from calstudy.base.resources import Usage, cores, free_memory, parse_memory
-from calstudy.base.schema import plain
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
@@ -57,16 +58,14 @@ class WorkOrder:
     @classmethod
     def of(cls, task: Task, store: Store, again: bool = False) -> WorkOrder:
         """Return the order for `task`; with `again`, its product is made even if it exists."""
-        own = made_with(task)
         inputs = {name: (needed.stage.name, needed.key) for name, needed in task.needs.items()}
-        bare = task.given({name: name for name in inputs})
         return cls(
-            task=bare,
+            task=task.given({name: name for name in inputs}),
             key=task.key,
             inputs=inputs,
             store=store.root,
             again=again,
-            made_with=own,
+            made_with=made_with(task),
             content=task.content,
             disk=task.cost.disk,
         )
@@ -174,7 +173,7 @@ def _make(order: WorkOrder, store: Store) -> Product:
             "stage_version": task.stage.version,
             "key": order.key,
             "label": task.label,
-            "settings": plain(task.settings),
+            "settings": to_jsonable_python(task.settings),
             "inputs": order.inputs,
             "notes": notes,
             "temporary": task.temporary,
@@ -211,13 +210,10 @@ BEGUN, WAITS = "begun", "waits"
 
 @dataclass(frozen=True)
 class Schedule:
-    """Tasks that a run must make.
+    """Tasks that a run must make, every one after its inputs.
 
-    Attributes
-    ----------
-    todo : tasks to make, every one after its inputs
-    damaged : tasks whose product is damaged; they are in `todo`
-    again : keys of intact products of other code that are made again; their tasks are in `todo`
+    Among them are those with damaged products, and those of intact products of other code, by key, that are made
+    `again`.
     """
 
     todo: tuple[Task, ...]
@@ -229,12 +225,9 @@ class Schedule:
 class Budget:
     """Resources of a run.
 
-    Attributes
-    ----------
-    workers : number of worker processes, or None for one per core within the memory
-    max_memory : memory of all workers together, such as "6 GB", or None for all free memory
-    scheduler : address of a running dask scheduler, whose memory is not checked, or None
-    strict : if true, products of other code or other versions of packages are made again, which need memory as well
+    Without a number of workers there is one for each core within the memory; `max_memory` of all workers together is
+    such as "6 GB", by default all that is free. The memory of a running dask scheduler, given by its address, is not
+    checked. A `strict` run also makes products of other code or other versions of packages again.
     """
 
     workers: int | None = None
@@ -294,16 +287,20 @@ def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
     return [task for task in kept if task.key not in found and store.exists(task.stage.name, task.key)]
 
 
-def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False) -> Schedule:
+def schedule(
+    targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False, quick: bool = False
+) -> Schedule:
     """Find the tasks to make: the targets and all that they need, unless the store has them intact.
 
     A kept product without an intact record is made again even if nothing else has to be made from it. Products with
     keys in `given` are not made. With `strict`, products of other code or other versions of packages are made again.
+    A `quick` look reads no files of products, and misses damaged ones behind what is intact.
     """
     other: Container[str] = ()
     if strict:
         tasks = unique(targets)
         other = of_other_code(tasks, found_of(tasks, store))
+    look, lost = (store.find, []) if quick else (store.verify, without_record(targets, store))
     again: set[str] = set()
     todo: dict[str, Task] = {}
     intact: set[str] = set()
@@ -312,7 +309,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
     def visit(task: Task) -> None:
         if task.key in todo or task.key in intact or task.key in given:
             return
-        product = store.verify(task.stage.name, task.key)
+        product = look(task.stage.name, task.key)
         if product is not None and task.key not in other:
             intact.add(task.key)
             return
@@ -324,7 +321,7 @@ def schedule(targets: Sequence[Task], store: Store, given: Container[str] = (), 
             visit(needed)
         todo[task.key] = task
 
-    for task in (*targets, *without_record(targets, store)):
+    for task in (*targets, *lost):
         visit(task)
     return Schedule(tuple(todo.values()), tuple(damaged), frozenset(again))
 

@@ -30,12 +30,13 @@ little of the pace of what follows."""
 class Forecast:
     """Estimate the remaining time of a run from the estimated cost of its tasks and the pace so far.
 
-    Costs are seconds of one core by key; `workers` is the number of tasks that are made at a time.
+    Costs are seconds of one core by key; `workers` is the number of tasks that are made at a time, and `count` that of
+    tasks that were made.
     """
 
     def __init__(self, costs: dict[str, float], workers: int) -> None:
         self._costs, self._workers = costs, workers
-        self._total, self._made = sum(costs.values()), 0.0
+        self._total, self._made, self.count = sum(costs.values()), 0.0, 0
         self._start = time.perf_counter()
 
     @property
@@ -46,6 +47,7 @@ class Forecast:
     def finish(self, key: str) -> float:
         """Count a task as made; return the remaining seconds at the present pace."""
         self._made += self._costs[key]
+        self.count += 1
         elapsed = time.perf_counter() - self._start
         pace = (elapsed + PLANNED_SECONDS) / (self._made / self._workers + PLANNED_SECONDS)
         return pace * max(0.0, self._total - self._made) / self._workers
@@ -58,16 +60,11 @@ def report(
     """Yield a function that reports each product when it is made; costs are estimated seconds by key."""
     forecast = Forecast(costs, workers)
     if not console.is_terminal:
-        count = 0
 
         def line(task: Task, product: Product) -> None:
-            nonlocal count
-            count += 1
-            left = duration(forecast.finish(task.key))
-            seconds = duration(product.record["seconds"])
-            console.print(
-                f"[{count}/{len(tasks)}] {task.stage.name}: {task.label} ({seconds}), about {left} left", markup=False
-            )
+            left, seconds = duration(forecast.finish(task.key)), duration(product.record["seconds"])
+            place = f"[{forecast.count}/{len(tasks)}]"
+            console.print(f"{place} {task.stage.name}: {task.label} ({seconds}), about {left} left", markup=False)
 
         yield line
         return
@@ -81,14 +78,10 @@ def report(
     )
     with Progress(*columns, console=console, transient=True) as progress:
         bar = progress.add_task("starting workers", total=1.0, made=0, left="")
-        made = 0
 
         def advance(task: Task, product: Product) -> None:
-            nonlocal made
-            made += 1
             left = f"about {duration(forecast.finish(task.key))} left"
-            progress.update(
-                bar, completed=forecast.fraction, made=made, left=left, description=f"{task.stage.name}: {task.label}"
-            )
+            made, described = forecast.count, f"{task.stage.name}: {task.label}"
+            progress.update(bar, completed=forecast.fraction, made=made, left=left, description=described)
 
         yield advance

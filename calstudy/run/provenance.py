@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
@@ -20,7 +19,7 @@ from calstudy.base.files import digest_json, sha256
 from calstudy.base.kept_arrays import kept_arrays
 from calstudy.base.package_files import PackageFile
 from calstudy.base.paths import leaves
-from calstudy.base.resources import cores
+from calstudy.base.resources import cores, total_memory
 from calstudy.run.source import source_of
 from calstudy.run.store import Product
 from calstudy.run.task import Task
@@ -164,7 +163,7 @@ def machine() -> dict[str, Any]:
     return {
         "processor": processor(),
         "cores": cores(),
-        "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
+        "memory_gb": round(total_memory() / 1e9, 1),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
     }

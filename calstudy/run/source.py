@@ -65,11 +65,10 @@ class _Module:
 
 
 @dataclass(frozen=True)
-class _Definition:
-    digest: str
+class _Definition(Source):
+    """A single definition; `needs` are those that it reaches directly, and are not in its digest."""
+
     needs: frozenset[Address]
-    packages: frozenset[str]
-    files: frozenset[PackageFile]
 
 
 def source_of(make: Callable[..., Any], settings: Mapping[str, Any]) -> Source:
@@ -250,7 +249,7 @@ def _definition(address: Address) -> _Definition:
         if _calls(node, PackageFile)
     }
     digest = sha256(_normal(statements).encode()).hexdigest() if statements else ""
-    return _Definition(digest, frozenset(needs), frozenset(packages), frozenset(files))
+    return _Definition(digest, frozenset(packages), frozenset(files), frozenset(needs))
 
 
 def _names(node: ast.AST, local: frozenset[str] = frozenset()) -> Iterator[tuple[str, str]]:

@@ -32,7 +32,7 @@ from uuid import uuid4
 
 from filelock import FileLock, Timeout
 
-from calstudy.base.errors import InputError, error_number
+from calstudy.base.errors import InputError, error_number, errors_of_files
 from calstudy.base.files import digest_json, sha256
 from calstudy.run.task import Task
 
@@ -99,10 +99,8 @@ class Store:
     def prepare(self) -> None:
         """Create the folder if necessary; raises InputError if it cannot be written."""
         require_writable(self.root, f"outputs.store = {str(self.root)!r}")
-        try:
+        with errors_of_files(f"outputs.store = {str(self.root)!r}: cannot be made"):
             self.root.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"outputs.store = {str(self.root)!r}: cannot be made ({error.strerror})") from None
 
     def folder(self, stage: str, key: str) -> Path:
         """Return the folder of the product with this stage and key, which need not exist.

@@ -62,12 +62,8 @@ class Task(Declared, ABC):
     """One product to be made. A kind of product is a subclass, with the name and the version of its stage.
 
     Its fields are the products that it needs (`Input`, `Inputs`, `Piece`) and all settings that it reads: validated
-    sections of the experiment, and plain JSON-able values. A setting with its default is not part of the key.
-
-    Attributes
-    ----------
-    label : description of the product in a few words
-    temporary : whether the product may be removed once the products that need it are made
+    sections of the experiment, and plain JSON-able values. A setting with its default is not part of the key. The label
+    describes the product in a few words; a temporary one may be removed once the products that need it are made.
     """
 
     stage: ClassVar[Stage]

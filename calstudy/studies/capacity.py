@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 from calstudy.base.errors import InputError
@@ -15,10 +14,9 @@ from calstudy.experiment.model import Experiment
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.products.calibration import CalibrateChunk
 from calstudy.products.simulation import SimulateChunk
-from calstudy.run.execution import Budget, found_of
-from calstudy.run.provenance import of_other_code
+from calstudy.run.execution import Budget, schedule
 from calstudy.run.store import Store
-from calstudy.run.task import Task, unique
+from calstudy.run.task import Task
 
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""
@@ -68,14 +66,19 @@ def require_data_fit(experiment: Experiment, budget: Budget) -> None:
 
 def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget) -> int:
     """Return how many workers fit into the memory, of those hoped for; raises InputError if not even one does."""
-    needs = {task: task.cost.memory for task in missing}
-    if not needs:
+    if not missing:
         return budget.workers or hoped
-    largest = max(needs, key=needs.__getitem__)
-    _require_room(largest, needs[largest], memory, "--max-memory leaves" if budget.max_memory else "this machine has")
+    largest = max(missing, key=lambda task: task.cost.memory)
+    need, source = largest.cost.memory, "--max-memory leaves" if budget.max_memory else "this machine has"
+    if need > memory:
+        more = "give it more with --max-memory, or " if need < total_memory() else ""
+        raise InputError(
+            f"{source} {max(memory, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
+            f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
+        )
     if budget.workers is not None and budget.max_memory is None:
         return budget.workers
-    return min(hoped, max(1, int(memory // needs[largest])))
+    return min(hoped, max(1, int(memory // need)))
 
 
 def _require_sane(budget: Budget) -> None:
@@ -85,15 +88,6 @@ def _require_sane(budget: Budget) -> None:
         raise InputError(
             f"--workers {budget.workers}: at most {most} are allowed on this machine, which has {cores()} processor "
             "core(s); leave it out for one per core"
-        )
-
-
-def _require_room(largest: Task, need: float, budget: float, source: str) -> None:
-    if need > budget:
-        more = "give it more with --max-memory, or " if need < total_memory() else ""
-        raise InputError(
-            f"{source} {max(budget, 0) / 1e9:.1f} GB of memory for work, but {largest.stage.name} ({largest.label}) "
-            f"needs about {need / 1e9:.1f} GB; {more}use fewer antennas, channels, integrations or sources"
         )
 
 
@@ -107,7 +101,9 @@ class _Work(Generic[File]):
 
     @cached_property
     def missing(self) -> Sequence[Task]:
-        return _missing(self.targets(self.file), self.file.outputs.store, self.strict)
+        """The tasks, from a quick look at the store."""
+        store = Store(self.file.outputs.store)
+        return schedule(self.targets(self.file), store, strict=self.strict, quick=True).todo
 
     def largest(self, kind: type[Task]) -> float:
         """Return the memory of the largest missing product of a kind; zero if none is missing."""
@@ -141,20 +137,3 @@ def _stream(work: _Work[File], share: float) -> _Work[File]:
             break
         work = work.changed(calibration=leaner)
     return work
-
-
-def _missing(targets: Sequence[Task], folder: Path, strict: bool) -> Sequence[Task]:
-    """Return the tasks whose products are missing in the store or, with `strict`, of other code, from a quick look."""
-    store, found = Store(folder), {}
-    tasks = unique(targets) if strict else []
-    other = of_other_code(tasks, found_of(tasks, store))
-
-    def visit(task: Task) -> None:
-        if task.key not in found and (task.key in other or store.find(task.stage.name, task.key) is None):
-            found[task.key] = task
-            for needed in task.needs.values():
-                visit(needed)
-
-    for task in targets:
-        visit(task)
-    return tuple(found.values())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from string import Template
@@ -18,6 +18,7 @@ from calstudy import __version__
 from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.base.gain_files import CASACORE
+from calstudy.base.paths import leaves
 from calstudy.base.visibilities import flag_cube, from_cube, to_cube
 from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
 from calstudy.calibrate.records import PARALLEL_HANDS
@@ -50,13 +51,8 @@ def export(
 ) -> list[Path]:
     """Write the data of every world, make products that are missing in the store, and return the folders.
 
-    Raises InputError as `folders_of` does, or if the data cannot be made.
-
-    Parameters
-    ----------
-    worlds : from `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`
-    folder : that of a single world; several worlds have subfolders ``world-1`` and so on
-    file_format : one of `FORMATS`
+    The worlds are from `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`; several have
+    subfolders ``world-1`` and so on. Raises InputError as `folders_of` does, or if the data cannot be made.
     """
     folders = folders_of(worlds, folder, file_format, overwrite)
     fits = [fit(case.experiment, budget, lambda wanted: WorldData.of(wanted).tasks) for case in worlds.cases]
@@ -220,23 +216,14 @@ def _drawn(experiment: Experiment) -> dict[str, Any]:
     """Return new seeds of all random draws of an experiment, by dotted path."""
     full = experiment.model_dump(mode="json", include={"instrument", "sky", "corruption"})
     other = experiment.model_dump(mode="json", include=set(full), exclude_defaults=True)
-    changed = {block for block, _ in _walk(other, "")}
+    changed = [f"{path}." for path, _ in leaves(other)]
     # Effects may all be the default, whose seed is public.
-    drawn = (EFFECTS, AS_BUILT) if experiment.instrument.as_built.note else (EFFECTS,)
+    above = (f"{EFFECTS}.", f"{AS_BUILT}.") if experiment.instrument.as_built.note else (f"{EFFECTS}.",)
     found: dict[str, Any] = {}
-    for block, content in _walk(full, ""):
-        if block in DRAWN or block in changed or f"{block}.".startswith(tuple(f"{above}." for above in drawn)):
-            for name in SEEDS:
-                if name in content:
-                    two = [secrets.randbits(BITS) for _ in range(2)]
-                    found[f"{block}.{name}"] = two[0] if name == "seed" else two
+    for path, _ in leaves(full):
+        block, _, name = path.rpartition(".")
+        differs = block in DRAWN or path.startswith(above) or any(one.startswith(f"{block}.") for one in changed)
+        if name in SEEDS and differs:
+            two = [secrets.randbits(BITS) for _ in range(2)]
+            found[path] = two[0] if name == "seed" else two
     return found
-
-
-def _walk(value: Any, path: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield all blocks in nested settings, with their dotted paths."""
-    if isinstance(value, Mapping):
-        yield path, value
-    pairs = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
-    for key, item in pairs:
-        yield from _walk(item, f"{path}.{key}" if path else str(key))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from calstudy.base.errors import InputError, exit_status
+from calstudy.base.errors import InputError, errors_of_files, exit_status
 from calstudy.experiment.model import Folders
 from calstudy.results.reader import EXPERIMENT, MANIFEST
 from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
@@ -33,13 +33,11 @@ def open_folder(folder: Path, subfolders: Sequence[str]) -> None:
     """
     results = {"report.html", "figures", "tables", *subfolders, "regression.json"}
     known = results | {MANIFEST, EXPERIMENT, LOG, *CLAIMS_FILES}
-    try:
+    with errors_of_files(f"outputs.runs = {str(folder.parent)!r}: cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name not in known and path.name[0] != ".")
         (folder / LOG).touch()
         _remove_leftovers(folder)
-    except OSError as error:
-        raise InputError(f"outputs.runs = {str(folder.parent)!r}: cannot be written ({error.strerror})") from None
     if strangers:
         raise InputError(
             f"outputs.runs: {folder} holds {strangers[0]!r}, which no run wrote; move it or choose another folder"

@@ -177,7 +177,7 @@ def _of_file(foregrounds: GleamSources | FileSources, channels: Channels, digest
 
 def require_calibration(experiment: Experiment) -> None:
     """Raise InputError if the calibrator refuses the antennas, baselines and channels of an experiment."""
-    if any(variant.calibrate for variant in experiment.variants.values()):
+    if experiment.calibrates:
         world = assumed_world(experiment)
         require_beams(world.instrument)
         _require_another_sky(experiment)
@@ -211,12 +211,8 @@ def _require_calibrators(experiment: Experiment) -> None:
             if not any(calibrator is other for other in asked):
                 asked.append(calibrator)
                 frame = frame_of(experiment.instrument)
-                require_calibratable(calibrator, frame, _has_sky_model(experiment))
-
-
-def _has_sky_model(experiment: Experiment) -> bool:
-    given = SKY_MODEL in assumed_changes(experiment.calibration.assumed)
-    return given or assumed_world(experiment).sky.has_foregrounds
+                given = SKY_MODEL in assumed_changes(experiment.calibration.assumed)
+                require_calibratable(calibrator, frame, given or assumed_world(experiment).sky.has_foregrounds)
 
 
 def _require_same_antennas(true: Layout, assumed: Layout) -> None:

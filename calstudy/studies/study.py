@@ -63,18 +63,9 @@ class RunProducts:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A finished run: its folder, its products, all tasks whose products it made or looked up, and runs of its parts.
 
-    Attributes
-    ----------
-    folder
-        Contains the resolved file, the manifest, the log, figures and tables.
-    made
-        Its products.
-    tasks
-        All tasks whose products the run made or looked up.
-    parts
-        Runs of its parts, with their own folders, by name.
+    The folder contains the resolved file, the manifest, the log, figures and tables; parts have their own, by name.
     """
 
     folder: Path
@@ -108,18 +99,13 @@ class Study(ABC):
 
     Attributes
     ----------
-    key
-        The key that marks a file of a built-in kind.
-    model
-        The content of a file.
-    heading, guide
-        Of the kind in the reference of all fields, and what is written there about its files.
-    subfolders
-        Folders in the run folder besides figures and tables.
+    key : the key that marks a file of a built-in kind
+    model : the content of a file
+    heading, guide : of the kind in the reference of all fields, and what is written there about its files
+    subfolders : folders in the run folder besides figures and tables
     keeps_tables
         True if the manifest lists the files of the tables with digests, so that a collection can take them from there.
-    has_reference
-        True if figures and claims of a run may be a reference for `calstudy regress`.
+    has_reference : true if figures and claims of a run may be a reference for `calstudy regress`
     """
 
     key: ClassVar[str] = ""
@@ -305,12 +291,7 @@ def make(
     """Make the products that are missing in the store with all their inputs, and report the progress.
 
     A read-only store is sufficient if nothing is missing. With `strict`, products of other code or other package
-    versions are made again.
-
-    Raises
-    ------
-    InputError
-        If the store must be written and cannot be, or a stage refuses its input.
+    versions are made again. Raises InputError if the store must be written and cannot be, or a stage refuses its input.
     """
     lease = Lease(store)
     is_complete = len(found_of(targets, store)) == len({task.key for task in targets})
@@ -364,22 +345,10 @@ def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) ->
 
 
 def run_study(study: Study, budget: Budget | None = None, console: Console | None = None) -> Run:
-    """Make all products of a study that are missing in the store, and fill its run folder.
+    """Make all products of a study that are missing in the store, and fill its run folder; without console, silently.
 
-    Parameters
-    ----------
-    study
-        From `calstudy.studies.load.load_study`.
-    budget
-        Workers and memory, and whether products of other code are made again.
-    console
-        Console for the progress; None for no output.
-
-    Raises
-    ------
-    InputError
-        If the study does not fit the machine, the store or a run folder cannot be written, or a stage refuses its
-        input.
+    Raises InputError if the study does not fit the machine, the store or a run folder cannot be written, or a stage
+    refuses its input.
     """
     budget, console = budget or Budget(), console or Console(quiet=True)
     study, count = study.sized_to(budget)

@@ -65,7 +65,8 @@ class Ladder(Study):
         if unknown:
             listed = ", ".join(sorted(built_in, key=float))
             raise InputError(f"{unknown[0]}: not a step of the ladder (there are: {listed}; or a file.py)")
-        found = sorted((_make(built_in.get(name, name), scale) for name in names or built_in), key=_place)
+        made = (_make(built_in.get(name, name), scale) for name in names or built_in)
+        found = sorted(made, key=lambda step: float(step.number))
         load = partial(_experiment, scale, file.overrides)
         steps = tuple((step, {name: load(name, case) for name, case in step.experiments.items()}) for step in found)
         every = [experiment for _, experiments in steps for experiment in experiments.values()]
@@ -141,10 +142,6 @@ class Ladder(Study):
         for number, task in self.measurements.items():
             publish([made.products[task.key]], self.folder / "tables" / number)
         super().write_results(made)
-
-
-def _place(step: Step) -> float:
-    return float(step.number)
 
 
 def _products(step: Step, experiment: Experiment) -> list[Task]:

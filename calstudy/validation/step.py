@@ -136,16 +136,11 @@ class Step(Paper):
 
     Attributes
     ----------
-    number, proves
-        Its place in the ladder, such as "2.1", and what it proves, in words.
-    experiments
-        The experiments on whose products it measures, by name.
-    sections
-        Sections of the experiments that the measurement itself reads; those that only affect products are not named.
-    parameters, small_parameters
-        Values of the fields, and others of these at small scale.
-    limits
-        The conditions on its numbers, by name.
+    number, proves : its place in the ladder, such as "2.1", and what it proves, in words
+    experiments : the experiments on whose products it measures, by name
+    sections : those of the experiments that the measurement itself reads, not those that only affect products
+    parameters, small_parameters : values of the fields, and others of these at small scale
+    limits : the conditions on its numbers, by name
     """
 
     registry: ClassVar = STEPS

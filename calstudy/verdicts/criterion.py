@@ -13,15 +13,10 @@ Kind = Literal["error", "scatter", "at least", "at most"]
 
 
 class Finding(NamedTuple):
-    """A measured number.
+    """A measured number with its uncertainty.
 
-    Attributes
-    ----------
-    value : the number
-    uncertainty : one standard deviation, or the scatter that the quantity names
-    kind
-        "error" if `uncertainty` is the standard deviation of the number; "scatter" if it is that of the values whose
-        median the number is; "at least" or "at most" if the number is a bound of the measured quantity.
+    The kind is "error" if that is the standard deviation of the number, "scatter" if it is that of the values whose
+    median the number is, and "at least" or "at most" if the number is a bound of the measured quantity.
     """
 
     value: float

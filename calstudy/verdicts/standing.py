@@ -199,13 +199,10 @@ def standings(
 ) -> list[InBand]:
     """Return the verdict on every calibrator in every band of k, band by band.
 
-    Parameters
-    ----------
-    scores : the content of comparison.json: scores by world and calibrator
-    refusals : world, calibrator and reason of those that cannot work
-    limit : largest tolerated bias, over the EoR
+    Scores are by world and calibrator, as in comparison.json; refusals are world, calibrator and reason of those that
+    cannot work. The limit is the largest tolerated bias, over the EoR.
     """
-    found: dict[tuple[tuple[float, float], str], list[InWorld]] = {}
+    found = []
     refused = dict.fromkeys((world, calibrator) for world, calibrator, _ in refusals if world in scores)
     scored = [name for cases in scores.values() for name in cases]
     calibrators = dict.fromkeys([*scored, *(calibrator for _, calibrator in refused)])
@@ -214,7 +211,7 @@ def standings(
     )
     for low, high in bands:
         for name in calibrators:
-            rows = found.setdefault(((low, high), name), [])
+            rows: list[InWorld] = []
             for world, cases in scores.items():
                 if name in cases:
                     bands_there = cases[name]["bands"]
@@ -224,7 +221,9 @@ def standings(
                     ]
                 elif (world, name) in refused:
                     rows.append(InWorld(world, refused=True))
-    return [InBand(name, band, worlds, limit) for (band, name), worlds in found.items() if worlds]
+            if rows:
+                found.append(InBand(name, (low, high), rows, limit))
+    return found
 
 
 def _in_world(world: str, band: Mapping[str, Any], solves: Mapping[str, int]) -> InWorld:

@@ -36,13 +36,9 @@ class Statement(Criterion):
     and undecided if it has parts of both. A bound is an interval that is open to one side. The scatter of values is
     not an error of their median, and widens the interval only by the sigmas of the threshold.
 
-    Attributes
-    ----------
-    name, section, sentence, quantity, threshold, why : as in `Criterion`; `section` is that of the paper
-    roles : the roles of the runs that are compared
-    measure : measures the number on the runs that play `roles`, in their order
-    sentence_id, tests_simulation : as in `Verdict`
-    pooled : measures the number on runs that pool realizations, or None if it exists only for single runs
+    `measure` measures the number on the runs that play `roles`, in their order, and `pooled` on runs that pool
+    realizations, or is None if the number exists only for single runs. The section is that of the paper; `sentence_id`
+    and `tests_simulation` are as in `Verdict`.
     """
 
     roles: tuple[str, ...]
@@ -120,14 +116,8 @@ class Source:
     ) -> Callable[[Callable[..., Finding]], Statement]:
         """Return a decorator that makes a statement of the function that measures it, named after the function.
 
-        Parameters
-        ----------
-        sentence : the sentence of the paper; a `Sentence` if it has several statements
-        quantity : the measured quantity, in words
-        threshold : the condition for it
-        why : the reason for this threshold
-        roles : roles of the runs that the function takes; by default those of the source
-        pooled : as in `Statement`
+        A sentence of the paper with several statements is a `Sentence`. Roles of the runs that the function takes are
+        by default those of the source; all else is as in `Statement`.
         """
 
         def make(measure: Callable[..., Finding]) -> Statement:

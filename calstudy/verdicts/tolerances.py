@@ -32,17 +32,10 @@ class Fixed:
 class Drawn:
     """May change to another draw: compared in units of the error of a difference of two draws, √2 σ.
 
-    Attributes
-    ----------
-    error
-        Function of the reference arrays and the array's name that returns the standard deviation σ of each element
-        (of the real part, if they are complex), in a shape that broadcasts.
-    why : description of the error bar
-    largest : largest deviation of an element, σ
-    rms : largest root mean square of the deviations, σ
-    shift
-        Largest mean deviation in its own standard errors, as if the elements were independent; a common shift of the
-        whole array shows here first.
+    `error` returns σ of each element (of the real part, if they are complex), in a shape that broadcasts, for the
+    reference arrays and the array's name, and `why` describes it. The limits are those of the `largest` deviation of an
+    element, of the `rms` of all, σ, and of the mean deviation in its own standard errors, as if the elements were
+    independent: a common `shift` of the whole array shows there first.
     """
 
     error: Callable[[Arrays, str], np.ndarray]

@@ -8,9 +8,11 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
+from pydantic_core import to_jsonable_python
+
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import Plugin
-from calstudy.base.schema import Section, plain
+from calstudy.base.schema import Section
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.files import override, validate
 from calstudy.studies.kinds.experiment import ExperimentStudy
@@ -138,7 +140,7 @@ def blocks(value: Any, annotation: Any) -> list[dict[str, Any]]:
 
 def values(value: Any, annotation: Any) -> Iterator[Any]:
     """Yield other values of a field, as far as its type tells; a quantity with its unit."""
-    written = plain(value)
+    written = to_jsonable_python(value)
     quantity = re.fullmatch(r"(-?[\d.]+(?:e[+-]?\d+)?)( .+)", written) if isinstance(written, str) else None
     if quantity is not None:
         number, unit = float(quantity[1]), quantity[2]

@@ -15,7 +15,7 @@ from calstudy.instrument.antenna_beams import make_beams
 from calstudy.instrument.interface import AntennaBeams
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.papers.calamity2022 import substitutions
+from calstudy.papers.calamity2022 import Calamity2022
 from calstudy.products import corruption, simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
@@ -135,7 +135,7 @@ def test_an_array_of_like_antennas_is_identified_as_before(tmp_path: Path):
     groups = {"antenna_beams": {"odd": {"antennas": [1], "beam": WIDE}}}
     other = validate({**SMALL, "instrument": {**SMALL["instrument"], **groups}}, tmp_path)
     assert simulation.foregrounds(Graph(other)).key != simulation.foregrounds(Graph(plain)).key
-    assert "antennas with another: 1" in " ".join(substitutions(other))
+    assert "antennas with another: 1" in " ".join(Calamity2022().substitutions(other))
     # What does not look through the beams stays the same.
     assert corruption.gains(Graph(other)).key == corruption.gains(Graph(plain)).key
 

@@ -23,7 +23,7 @@ from calstudy.products.files import GAINS, read_json
 from calstudy.products.graph import Graph, required
 from calstudy.products.signal_loss import SCALE, FluxScale, transfer
 from calstudy.studies.kinds.experiment import ExperimentStudy
-from calstudy.studies.kinds.sweep import Sweep, expand
+from calstudy.studies.kinds.sweep import Sweep
 from calstudy.studies.load import load_study
 from calstudy.studies.show import show_run
 from calstudy.studies.study import Budget, Run, run_study
@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def swept(folder) -> Run:
-    return run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)), Budget(workers=1))
+    return run_study(Sweep.of(validate({**small(folder), "sweep": SWEEP}, folder)), Budget(workers=1))
 
 
 def table(result: Run, point: int, name: str, kind: type = TransferFunction):
@@ -191,21 +191,21 @@ def test_the_end_of_a_sweep_has_t_of_every_point(swept):
 
 
 def test_a_second_sweep_makes_nothing(swept, folder):
-    again = run_study(expand(validate({**small(folder), "sweep": SWEEP}, folder)), Budget(workers=1))
+    again = run_study(Sweep.of(validate({**small(folder), "sweep": SWEEP}, folder)), Budget(workers=1))
     assert again.made.tasks == ()
     assert again.folder == swept.folder
 
 
 def test_the_same_sweep_reads_back_from_its_run_folder(swept):
     experiment = load(swept.folder / "experiment.yaml")
-    assert {task.key for task in expand(experiment).targets} <= set(swept.made.products)
+    assert {task.key for task in Sweep.of(experiment).targets} <= set(swept.made.products)
     resolved = swept.folder / "experiment.yaml"
     assert resolved.read_text() == dump(experiment)
 
 
 @pytest.mark.parametrize("scale", [None, "small"])
 def test_the_shipped_sweep_varies_what_the_paper_says_loss_depends_on(scale):
-    family = expand(load(Path(__file__).parents[2] / "experiments" / "signalloss.yaml", scale))
+    family = Sweep.of(load(Path(__file__).parents[2] / "experiments" / "signalloss.yaml", scale))
     varied = {field for point in family.points for field in point.changes}
     assert varied >= {
         "calibration.basis.buffer",
@@ -220,7 +220,7 @@ def test_the_shipped_sweep_varies_what_the_paper_says_loss_depends_on(scale):
 
 def faults_of(data: dict, folder) -> list[str]:
     with pytest.raises(ExperimentError) as caught:
-        expand(validate(data, folder))
+        Sweep.of(validate(data, folder))
     return caught.value.faults
 
 
@@ -265,7 +265,7 @@ def test_all_faults_of_a_sweep_are_told_at_once(folder):
 
 
 def test_what_the_calibrator_refuses_is_told_with_the_point_before_anything_is_made(folder):
-    sweep = expand(validate({**small(folder), "sweep": {"calibration.basis.buffer": ["50 ns", "9 us"]}}, folder))
+    sweep = Sweep.of(validate({**small(folder), "sweep": {"calibration.basis.buffer": ["50 ns", "9 us"]}}, folder))
     with pytest.raises(InputError, match=r"^02-buffer=9us: calibration\.basis: a delay half-width of \d+ ns fills"):
         run_study(sweep, Budget(workers=1))
     assert not sweep.folder.exists()
@@ -299,12 +299,12 @@ def test_a_file_with_a_sweep_is_a_sweep_and_one_without_is_none(folder):
         (folder / name).write_text(yaml.safe_dump(data))
         assert isinstance(load_study(folder / name), kind)
     with pytest.raises(InputError, match="has no sweep"):
-        expand(validate(small(folder), folder))
+        Sweep.of(validate(small(folder), folder))
 
 
 def test_blocks_as_values_vary_fields_together(folder):
     sweep = {"instrument.channels": [{"first": "170 MHz", "width": "200 kHz", "count": 64}]}
-    family = expand(validate({**small(folder), "sweep": sweep}, folder))
+    family = Sweep.of(validate({**small(folder), "sweep": sweep}, folder))
     (point,) = family.points
     assert family.members[point.label].instrument.channels.count == 64
     assert point.changes == {"instrument.channels": "first 170 MHz, width 200 kHz, count 64"}
@@ -313,7 +313,7 @@ def test_blocks_as_values_vary_fields_together(folder):
 
 def test_blocks_may_have_a_point_in_common(folder):
     sweep = [{"sky.eor.seed": [2, 12]}, {"corruption.noise.factor": [2, 3]}]
-    family = expand(validate({**small(folder), "sweep": sweep}, folder))
+    family = Sweep.of(validate({**small(folder), "sweep": sweep}, folder))
     first, third = (family.members[family.points[place].label] for place in (0, 2))
     assert (first.sky.eor.seed, first.corruption) == (third.sky.eor.seed, third.corruption)
 

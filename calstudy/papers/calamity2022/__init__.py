@@ -114,7 +114,7 @@ class Calamity2022(Paper):
 
     def substitutions(self, experiment: Experiment) -> tuple[str, ...]:
         """Return one short sentence for each ingredient that an experiment uses in place of the paper's own."""
-        return substitutions(experiment)
+        return tuple(note for note in (_sky(experiment), _beam(experiment), _scale(experiment)) if note)
 
 
 def _study(role: str) -> str:
@@ -257,8 +257,3 @@ def _scale(experiment: Experiment) -> str | None:
     if sources is not None:
         reductions.append(f"the {sources} brightest sources")
     return f"reduced scale: {', '.join(reductions)}" if reductions else None
-
-
-def substitutions(experiment: Experiment) -> tuple[str, ...]:
-    """Return one short sentence per substitution of the experiment, empty if all ingredients are the paper's."""
-    return tuple(note for note in (_sky(experiment), _beam(experiment), _scale(experiment)) if note)

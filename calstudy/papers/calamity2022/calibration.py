@@ -13,7 +13,7 @@ SIMULATED = replace(RESULTS, tests_simulation=True)
 FACTOR_OF_TWO = "the paper's 'similar', 'about' and 'roughly' are read as within a factor of two"
 
 
-def _median(run: Results, name: str) -> Finding:
+def median(run: Results, name: str) -> Finding:
     """Return the median over antennas or baselines, with their scatter."""
     found = run.measured(name)
     return Finding(found.value, found.scatter, "scatter")
@@ -30,12 +30,12 @@ GAINS_CAPTION = Sentence("gain-residuals", "their residuals are on the order of 
     GAINS, "rms of g - ĝ over rms of g, free of phase and scale that no fit can know; median", AtMost(0.2), "≲ 20 %"
 )
 def gains_within_20_percent(run: Results) -> Finding:
-    return _median(run, "gains_aligned")
+    return median(run, "gains_aligned")
 
 
 @RESULTS.states(GAINS, "rms of g - ĝ over rms of g, gains as fitted; median", AtMost(0.2), "≲ 20 %")
 def gains_within_20_percent_raw(run: Results) -> Finding:
-    return _median(run, "gains_raw")
+    return median(run, "gains_raw")
 
 
 @RESULTS.states(
@@ -45,7 +45,7 @@ def gains_within_20_percent_raw(run: Results) -> Finding:
     "≲ 20 %",
 )
 def gains_within_20_percent_at_typical_delay(run: Results) -> Finding:
-    return _median(run, "gains_by_delay")
+    return median(run, "gains_by_delay")
 
 
 @RESULTS.states(
@@ -55,14 +55,14 @@ def gains_within_20_percent_at_typical_delay(run: Results) -> Finding:
     "≲ 20 % on all delays",
 )
 def gains_within_20_percent_at_every_delay(run: Results) -> Finding:
-    return _median(run, "gains_worst_delay")
+    return median(run, "gains_worst_delay")
 
 
 @RESULTS.states(
     GAINS_CAPTION, "rms of g - ĝ over rms of g, free of phase and scale; median", Within(0.05, 0.2), FACTOR_OF_TWO
 )
 def gains_of_order_10_percent(run: Results) -> Finding:
-    return _median(run, "gains_aligned")
+    return median(run, "gains_aligned")
 
 
 GAINS_BY_DELAY = Sentence(
@@ -77,7 +77,7 @@ GAINS_BY_DELAY = Sentence(
     FACTOR_OF_TWO,
 )
 def gains_of_order_10_percent_at_typical_delay(run: Results) -> Finding:
-    return _median(run, "gains_raw_by_delay")
+    return median(run, "gains_raw_by_delay")
 
 
 @RESULTS.states(
@@ -87,7 +87,7 @@ def gains_of_order_10_percent_at_typical_delay(run: Results) -> Finding:
     FACTOR_OF_TWO,
 )
 def gains_of_order_10_percent_at_every_delay(run: Results) -> Finding:
-    return _median(run, "gains_raw_worst_delay")
+    return median(run, "gains_raw_worst_delay")
 
 
 @RESULTS.states(
@@ -98,12 +98,12 @@ def gains_of_order_10_percent_at_every_delay(run: Results) -> Finding:
     FACTOR_OF_TWO,
 )
 def gains_of_order_10_percent_at_typical_delay_aligned(run: Results) -> Finding:
-    return _median(run, "gains_by_delay")
+    return median(run, "gains_by_delay")
 
 
 @RESULTS.states(GAINS_CAPTION, "rms of g - ĝ over rms of g, gains as fitted; median", Within(0.05, 0.2), FACTOR_OF_TWO)
 def gains_of_order_10_percent_raw(run: Results) -> Finding:
-    return _median(run, "gains_raw")
+    return median(run, "gains_raw")
 
 
 MODEL = Sentence(
@@ -116,17 +116,17 @@ MODEL = Sentence(
     MODEL, "rms of F - F̂ over rms of F, on the scale of the true gains; median", Within(0.05, 0.4), FACTOR_OF_TWO
 )
 def model_of_order_10_to_20_percent(run: Results) -> Finding:
-    return _median(run, "model_aligned")
+    return median(run, "model_aligned")
 
 
 @RESULTS.states(MODEL, "rms of F - F̂ over rms of F, model as fitted; median", Within(0.05, 0.4), FACTOR_OF_TWO)
 def model_of_order_10_to_20_percent_raw(run: Results) -> Finding:
-    return _median(run, "model_raw")
+    return median(run, "model_raw")
 
 
 @RESULTS.states(MODEL, "rms of F - F̂ over rms of N; median", AtLeast(2), "more than 'similar', a factor of two")
 def model_error_exceeds_noise(run: Results) -> Finding:
-    return _median(run, "model_over_noise")
+    return median(run, "model_over_noise")
 
 
 PRODUCT = Sentence(
@@ -142,19 +142,19 @@ PRODUCT = Sentence(
     FACTOR_OF_TWO,
 )
 def product_at_noise(run: Results) -> Finding:
-    return _median(run, "product_over_noise")
+    return median(run, "product_over_noise")
 
 
 @RESULTS.states(
     PRODUCT, "rms of V - ĝĝ*F̂ over that of the noise, at the worst delay", AtMost(2), "at all delays; " + FACTOR_OF_TWO
 )
 def product_at_noise_at_every_delay(run: Results) -> Finding:
-    return _median(run, "product_worst_delay")
+    return median(run, "product_worst_delay")
 
 
 @RESULTS.states(PRODUCT, "rms of V - ĝĝ*F̂ over rms of V; median", AtMost(0.002), "0.1 %; " + FACTOR_OF_TWO)
 def product_at_tenth_of_percent(run: Results) -> Finding:
-    return _median(run, "product_over_data")
+    return median(run, "product_over_data")
 
 
 @RESULTS.states(
@@ -177,7 +177,7 @@ def product_far_better_than_gains(run: Results) -> Finding:
     FACTOR_OF_TWO,
 )
 def correction_is_smooth(run: Results) -> Finding:
-    return _median(run, "correction_over_noise_outside")
+    return median(run, "correction_over_noise_outside")
 
 
 @RESULTS.states(
@@ -187,7 +187,7 @@ def correction_is_smooth(run: Results) -> Finding:
     FACTOR_OF_TWO,
 )
 def residual_at_noise_outside_wedge(run: Results) -> Finding:
-    return _median(run, "residual_over_noise_outside")
+    return median(run, "residual_over_noise_outside")
 
 
 @RESULTS.states(
@@ -197,7 +197,7 @@ def residual_at_noise_outside_wedge(run: Results) -> Finding:
     "a reduction is noticeable if it exceeds twice the scatter over baselines",
 )
 def residual_reduced_inside_wedge(run: Results) -> Finding:
-    return _median(run, "residual_over_noise_inside")
+    return median(run, "residual_over_noise_inside")
 
 
 @RESULTS.states(
@@ -207,4 +207,4 @@ def residual_reduced_inside_wedge(run: Results) -> Finding:
     "orders of magnitude are two at least",
 )
 def residual_far_below_gain_features(run: Results) -> Finding:
-    return _median(run, "data_over_residual_outside")
+    return median(run, "data_over_residual_outside")

@@ -21,8 +21,8 @@ from calstudy.claims.bins import (
     used_bins,
 )
 from calstudy.claims.realizations import over_realizations
-from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
-from calstudy.papers.calamity2022.window import UNBIASED
+from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, median
+from calstudy.papers.calamity2022.window import UNBIASED, agreement
 from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
@@ -92,9 +92,7 @@ def noise_reduced(minimal: Results, redundant: Results) -> Finding:
     roles=("redundant",),
 )
 def redundant_signal_recovered(redundant: Results) -> Finding:
-    residual, signal = (redundant.spherical(name, "outside-wedge") for name in ("residual", "eor"))
-    used = used_bins(residual, signal, k_min=K_LOSS)
-    return fraction_within((residual.power - signal.power).real[used], residual.error[used])
+    return agreement(redundant, K_LOSS)
 
 
 @REDUNDANT.states(
@@ -363,11 +361,9 @@ SINGLE = Sentence(
 
 @REFLECTED.states(SINGLE, "rms of V over that of N, delays outside the wedge; median", Within(0.5, 2), FACTOR_OF_TWO)
 def data_at_noise_on_single_baseline(run: Results) -> Finding:
-    found = run.measured("data_over_noise_outside")
-    return Finding(found.value, found.scatter, "scatter")
+    return median(run, "data_over_noise_outside")
 
 
 @LOW_SNR.states(SINGLE, "rms of R over that of N, delays outside the wedge; median", Within(0.5, 2), FACTOR_OF_TWO)
 def residual_at_noise_on_single_baseline(run: Results) -> Finding:
-    found = run.measured("residual_over_noise_outside")
-    return Finding(found.value, found.scatter, "scatter")
+    return median(run, "residual_over_noise_outside")

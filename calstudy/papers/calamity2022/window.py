@@ -132,6 +132,13 @@ def calibrated_window_consistent(run: Results) -> Finding:
     return Finding(float(np.average(near, weights=chosen.sum(axis=1)[rows])), float(0.5 / np.sqrt(near.size)))
 
 
+def agreement(run: Results, k_min: float) -> Finding:
+    """Return the part of the bins from `k_min` (h/Mpc) outside the wedge in which P^R is within 95 % errors of P^S."""
+    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
+    used = used_bins(residual, signal, k_min=k_min)
+    return fraction_within((residual.power - signal.power).real[used], residual.error[used])
+
+
 BROAD = Sentence(
     "broad-agreement",
     "P^R is in broad agreement with P^S beyond k ≳ 0.2 h/Mpc when we only average modes outside of the wedge",
@@ -150,9 +157,7 @@ UNBIASED = Sentence(
     "95 % by chance alone; broad agreement may miss a tenth",
 )
 def residual_agrees_outside_wedge(run: Results) -> Finding:
-    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
-    used = used_bins(residual, signal, k_min=K_AGREEMENT)
-    return fraction_within((residual.power - signal.power).real[used], residual.error[used])
+    return agreement(run, K_AGREEMENT)
 
 
 @RESULTS.states(
@@ -294,12 +299,13 @@ POSITIVE = Sentence(
 )
 
 
-def _positive_bias(run: Results) -> Finding:
-    residual = run.spherical("residual_without_eor", "outside-wedge")
-    signal = run.spherical("eor", "outside-wedge")
-    used = used_bins(residual, signal, k_max=K_SMALL)
+def _over_eor(run: Results, k_min: float, k_max: float, by_noise: bool = False) -> Finding:
+    """Return the mean over bins of P^R without EoR, perhaps weighted `by_noise` variances, over that of P^S."""
+    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
+    used = used_bins(residual, signal, k_min=k_min, k_max=k_max)
     level = float(np.mean(signal.power.real[used]))
-    left = power_without_eor(run, used, residual.noise_error[used] ** -2.0)
+    weights = residual.noise_error[used] ** -2.0 if by_noise else np.ones(used.sum())
+    left = power_without_eor(run, used, weights)
     return Finding(left.value / level, left.uncertainty / level)
 
 
@@ -311,7 +317,7 @@ def _positive_bias(run: Results) -> Finding:
     pooled=over_realizations("bias", "outside-wedge", 0.0, K_SMALL),
 )
 def positive_bias_at_small_k(run: Results) -> Finding:
-    return _positive_bias(run)
+    return _over_eor(run, 0.0, K_SMALL, by_noise=True)
 
 
 @RESULTS.states(
@@ -322,7 +328,7 @@ def positive_bias_at_small_k(run: Results) -> Finding:
     roles=("paper_solver",),
 )
 def positive_bias_at_small_k_with_papers_solver(run: Results) -> Finding:
-    return _positive_bias(run)
+    return _over_eor(run, 0.0, K_SMALL, by_noise=True)
 
 
 TAPERED = Sentence(
@@ -360,15 +366,6 @@ def _over_noise(run: Results, k_min: float, k_max: float) -> Finding:
     used = used_bins(residual, k_min=k_min, k_max=k_max)
     pulls = residual.power.real[used] / residual.noise_error[used]
     return Finding(float(np.mean(pulls)), float(used.sum() ** -0.5))
-
-
-def _over_eor(run: Results, k_min: float, k_max: float) -> Finding:
-    """Return the mean over bins of P^R without EoR over that of P^S."""
-    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
-    used = used_bins(residual, signal, k_min=k_min, k_max=k_max)
-    level = float(np.mean(signal.power.real[used]))
-    left = power_without_eor(run, used, np.ones(used.sum()))
-    return Finding(left.value / level, left.uncertainty / level)
 
 
 @RESULTS.states(

@@ -14,11 +14,11 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import BeforeValidator, Field, model_validator
 from rich.console import Console
 
-from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.errors import ExperimentError, InputError, errors_of_files
 from calstudy.base.files import sha256
 from calstudy.base.identity import identity
 from calstudy.base.schema import Section, fault
-from calstudy.claims.evaluation import combined_claims, members_by_role, refusal_of_role
+from calstudy.claims.evaluation import claims, members_by_role, refusal_of_role
 from calstudy.claims.paper import distinct_papers, unique_notes
 from calstudy.experiment.files import StudyFile, apply_scale, checked, overridden, read_mapping, validate
 from calstudy.experiment.model import Experiment, Figures, StudyName
@@ -180,7 +180,7 @@ class Collection(Family):
         """The statements of the members' papers, each evaluated on the members that play its roles, or None."""
         runs = {name: study.evaluated for name, study in self.studies.items()}
         papers = distinct_papers(paper for experiment in self.members.values() for paper in experiment.papers)
-        return combined_claims(self.name, runs, papers, self.roles, self.stand_ins)
+        return claims(self.name, papers, runs, self.stand_ins, self.roles)
 
     def _place(self, name: str) -> str:
         """Return the path of a member's folder, relative to the folder of runs."""
@@ -363,16 +363,14 @@ def _put(task: Task, run: FinishedRun, store: Store) -> None:
     """Put a table of a run into a store, under the key of its product."""
     entry, stage = run.tables[task.key], task.stage.name
     store.prepare()
-    with store.lock(stage, task.key), store.building(stage, task.key) as folder:
-        try:
-            for name in entry["files"]:
-                shutil.copyfile(run.folder / TABLES / name, folder / name)
-            kept = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
-            record = {"lineage": "", **kept}
-            origin = {key: run.manifest.get(key) for key in ("name", "finished", "git_commit")}
-            store.seal(folder, {**record, "stage": stage, "temporary": False, "from_run": origin})
-        except OSError as error:
-            raise InputError(f"outputs.store = {str(store.root)!r}: cannot be written ({error.strerror})") from None
+    unwritten = errors_of_files(f"outputs.store = {str(store.root)!r}: cannot be written")
+    with store.lock(stage, task.key), store.building(stage, task.key) as folder, unwritten:
+        for name in entry["files"]:
+            shutil.copyfile(run.folder / TABLES / name, folder / name)
+        kept = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
+        record = {"lineage": "", **kept}
+        origin = {key: run.manifest.get(key) for key in ("name", "finished", "git_commit")}
+        store.seal(folder, {**record, "stage": stage, "temporary": False, "from_run": origin})
 
 
 def _require_same(there: Product, files: Mapping[str, str], run: FinishedRun, store: Store) -> None:

@@ -207,18 +207,12 @@ class Comparison(Family):
 
     @classmethod
     def load(cls, file: StudyFile, calibrators: Mapping[str, Any] | None = None) -> Comparison:
-        """Return the comparison of a file.
+        """Return the comparison of a file, perhaps with other calibrators.
 
-        Raises InputError if a file cannot be read, or a scale or override cannot be applied, and ExperimentError if
-        fields are unknown, missing, or have values that are not allowed.
-
-        Parameters
-        ----------
-        file
-            Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
-            `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all
-            others are applied to the experiment of every case.
-        calibrators : in place of those of the file
+        Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
+        `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
+        applied to the experiment of every case. Raises InputError if a file cannot be read, or a scale or override
+        cannot be applied, and ExperimentError if fields are unknown, missing, or have values that are not allowed.
         """
         content, base, overrides, worlds = _read(file, calibrators)
         members = _experiments(content, worlds, base, lambda data: validate(data, file.folder))
@@ -236,10 +230,11 @@ class Comparison(Family):
         # All others are in the experiment.
         of_calibrators = {path: new for path, new in overrides.items() if path.partition(".")[0] == "calibration"}
         written = {"overrides": of_calibrators, "worlds": worlds, "calibrators": dict(content.calibrators)}
+        # Defaults and absolute paths, so that it does not depend on its folder.
         resolved = {
             "name": content.name,
             "description": content.description,
-            "experiment": _complete(base, file.folder),
+            "experiment": _shared(validate(_shared(base), file.folder).model_dump(mode="json")),
             **with_absolute_paths(written, members.values(), file.folder),
             "figures": [figure.model_dump(mode="json") for figure in figures],
             **({"salt": content.salt} if content.salt else {}),
@@ -395,13 +390,9 @@ def load_worlds(
 ) -> Comparison:
     """Return calibrators in the worlds of a comparison, or in the one of an experiment.
 
-    Raises InputError if the file is neither, or cannot be used.
-
-    Parameters
-    ----------
-    calibrators
-        Blocks `calibration` by label, in place of those of the file, with the assumptions of the experiment. None
-        for the file's own; that of an experiment has its own name as label.
+    `calibrators` are blocks `calibration` by label, in place of those of the file, with the assumptions of the
+    experiment. None is for the file's own; that of an experiment has its own name as label. Raises InputError if the
+    file is neither, or cannot be used.
     """
     file = StudyFile.open(path, scale, overrides)
     kind = kind_of(file.content, file.folder)
@@ -464,23 +455,17 @@ def _with_changes(
         # Blocks of calibrators come after overrides, and before worlds.
         for_all = path.startswith("calibration.")
         if not for_all:
-            overrides = _with_last(overrides, path, value)
+            overrides = {**_without(overrides, path), path: value}
         for world, fields in worlds.items():
-            kept = {field: own for field, own in fields.items() if not f"{field}.".startswith(f"{path}.")}
+            kept = _without(fields, path)
             again = for_all or any(path.startswith(f"{field}.") for field in kept)
-            worlds[world] = _with_last(fields, path, value) if again else kept
+            worlds[world] = {**kept, path: value} if again else kept
     return overrides, worlds
 
 
-def _with_last(changes: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
-    """Return changes with a last one, and without those of the same field and of fields in it."""
-    kept = {field: own for field, own in changes.items() if not f"{field}.".startswith(f"{path}.")}
-    return {**kept, path: value}
-
-
-def _complete(base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return an experiment with its defaults and absolute paths, so that it does not depend on its folder."""
-    return _shared(validate(_shared(base), folder).model_dump(mode="json"))
+def _without(changes: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """Return changes without those of a field and of fields in it."""
+    return {field: own for field, own in changes.items() if not f"{field}.".startswith(f"{path}.")}
 
 
 def _shared(experiment: Mapping[str, Any]) -> dict[str, Any]:

@@ -89,7 +89,8 @@ class ExperimentStudy(Study):
     @property
     def setup(self) -> str:
         """The array, band, times, gains, noise and calibrator."""
-        return describe_setup(self.experiment)
+        calibration = self.experiment.calibration.label if self.experiment.calibrates else "not calibrated"
+        return f"{describe_data(self.experiment)}; {calibration}"
 
     @cached_property
     def stand_ins(self) -> tuple[str, ...]:
@@ -110,7 +111,7 @@ class ExperimentStudy(Study):
     @cached_property
     def claims(self) -> Task | None:
         """The statements of the papers that the experiment names, or None."""
-        return claims(self.evaluated, self.stand_ins)
+        return claims(self.name, self.experiment.papers, {"": self.evaluated}, self.stand_ins)
 
     @property
     def evaluated(self) -> Evaluated:
@@ -158,13 +159,8 @@ class ExperimentStudy(Study):
 class Family(Study):
     """Several experiments, and the figures, tables and claims of all of them.
 
-    Products that several members need have one key, and are made once. If members have their own run folders, they are
-    the `parts` of a family.
-
-    Attributes
-    ----------
-    file : content of the file
-    members : the experiments by label, all with the same store and folder of runs
+    Members are the experiments by label, all with the same store and folder of runs. Products that several members need
+    have one key, and are made once. If members have their own run folders, they are the `parts` of a family.
     """
 
     file: Any
@@ -281,11 +277,6 @@ def fields_of(experiment: Experiment, changes: Iterable[Mapping[str, Any]]) -> d
             value = value_at(dict(value) if isinstance(value, BaseModel) else value, step)
         found[path] = value if value is None or type(value) in (int, float) else text_of(value)
     return found
-
-
-def describe_setup(experiment: Experiment) -> str:
-    """Return the data of an experiment and how they are calibrated."""
-    return f"{describe_data(experiment)}; {experiment.calibration.label if experiment.calibrates else 'not calibrated'}"
 
 
 def describe_data(experiment: Experiment) -> str:

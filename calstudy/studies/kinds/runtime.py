@@ -14,7 +14,7 @@ from calstudy.base.quiet import require_tensorflow
 from calstudy.base.schema import Section, fault
 from calstudy.base.units import Length
 from calstudy.calibrate.settings import BasisSettings
-from calstudy.claims.evaluation import run_time_claims
+from calstudy.claims.evaluation import RunTimeClaims
 from calstudy.claims.paper import distinct_papers
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Folders, Papers, Scales, StudyName
@@ -251,7 +251,8 @@ class RuntimeStudy(Study):
     @cached_property
     def claims(self) -> Task | None:
         """The papers' statements on run times, or None."""
-        return run_time_claims(self.name, distinct_papers(self.file.papers), self.summary)
+        papers = distinct_papers(self.file.papers)
+        return RunTimeClaims("claims", papers=papers, title=self.name, runtime=self.summary) if papers else None
 
     @property
     def tables(self) -> list[Task]:

@@ -62,12 +62,34 @@ class Sweep(Family):
     @classmethod
     def load(cls, file: StudyFile) -> Sweep:
         """Return the sweep of a file."""
-        return expand(file.experiment(), file.folder)
+        return cls.of(file.experiment(), file.folder)
 
     @classmethod
     def of(cls, experiment: Experiment, folder: Path = Path()) -> Sweep:
-        """Return the family of an experiment; parameters and errors as for `expand`."""
-        return expand(experiment, folder)
+        """Return the family of an experiment with a `sweep`, whose relative paths of files start at a folder.
+
+        Raises ExperimentError with one sentence per fault: a field that cannot be varied, is unknown, or does not take
+        a value, a point whose fields do not go together, or points of a block that are the same.
+        """
+        if not experiment.sweep:
+            raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
+        faults = _faults(experiment)
+        if faults:
+            raise ExperimentError(faults)
+        plain = experiment.model_dump(mode="json", exclude_unset=True, exclude={"sweep", "scales"})
+        experiments = []
+        for block in experiment.sweep:
+            found, faults_of_block = _experiments(block, plain, folder)
+            experiments += found
+            faults += [fault for fault in faults_of_block if fault not in faults]
+        if faults:
+            raise ExperimentError(faults)
+        swept = with_absolute_paths(experiment.sweep, experiments, folder)
+        numbers = itertools.count(1)
+        blocks = [tuple(_point(next(numbers), changes, block) for changes in _combinations(block)) for block in swept]
+        labels = (point.label for block in blocks for point in block)
+        members = dict(zip(labels, experiments, strict=True))
+        return cls(experiment.model_copy(update={"sweep": swept}), members, blocks)
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -120,43 +142,6 @@ class Sweep(Family):
         }
 
 
-def expand(experiment: Experiment, folder: Path = Path()) -> Sweep:
-    """Return the family of an experiment with a `sweep`, whose relative paths of files start at a folder.
-
-    Raises ExperimentError with one sentence per fault: a field that cannot be varied, is unknown, or does not take a
-    value, a point whose fields do not go together, or points of a block that are the same.
-    """
-    if not experiment.sweep:
-        raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
-    faults = _faults_of_fields(experiment.sweep)
-    count = sum(math.prod(len(values) for values in block.values()) for block in experiment.sweep)
-    if count > MOST_POINTS:
-        faults.append(
-            f"sweep: has {count} points, all combinations of the values, and at most {MOST_POINTS} are allowed; give "
-            "fewer values, or a list of blocks that vary one field each"
-        )
-    if not experiment.measures_signal_loss:
-        faults.append(
-            f"sweep: compares the signal loss of its points, which needs the variants {', '.join(SIGNAL_LOSS_VARIANTS)}"
-        )
-    if faults:
-        raise ExperimentError(faults)
-    plain = experiment.model_dump(mode="json", exclude_unset=True, exclude={"sweep", "scales"})
-    experiments = []
-    for block in experiment.sweep:
-        found, faults_of_block = _experiments(block, plain, folder)
-        experiments += found
-        faults += [fault for fault in faults_of_block if fault not in faults]
-    if faults:
-        raise ExperimentError(faults)
-    swept = with_absolute_paths(experiment.sweep, experiments, folder)
-    numbers = itertools.count(1)
-    blocks = [tuple(_point(next(numbers), changes, block) for changes in _combinations(block)) for block in swept]
-    labels = (point.label for block in blocks for point in block)
-    members = dict(zip(labels, experiments, strict=True))
-    return Sweep(experiment.model_copy(update={"sweep": swept}), members, blocks)
-
-
 def _experiments(
     block: Mapping[str, Sequence[Any]], plain: Mapping[str, Any], folder: Path
 ) -> tuple[list[Experiment], list[str]]:
@@ -167,7 +152,9 @@ def _experiments(
     for changes in _combinations(block):
         words = ", ".join(f"{path} = {text_of(value)}" for path, value in changes.items())
         try:
-            experiment = _varied(plain, changes, words, folder)
+            data = overridden(plain, changes)
+            data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
+            experiment = validate(data, folder)
         except InputError as error:
             sentences = error.faults if isinstance(error, ExperimentError) else [str(error)]
             faults += [f"sweep ({words}): {fault}" for fault in sentences]
@@ -185,13 +172,16 @@ def _combinations(block: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def _point(number: int, changes: Mapping[str, Any], block: Mapping[str, Sequence[Any]]) -> Point:
-    named = {path: changes[path] for path in varied_fields(block)}
+    """Return the point with a label of the fields that have several values, of the first field if none has."""
+    varied = [path for path, values in block.items() if len(values) > 1] or list(block)[:1]
+    named = {path: changes[path] for path in varied}
     return Point(_label(number, named), {path: text_of(value) for path, value in changes.items()})
 
 
-def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str]:
+def _faults(experiment: Experiment) -> list[str]:
+    """Return a sentence for every fault of a sweep that is known without its points."""
     faults = []
-    for path, values in ((path, values) for block in blocks for path, values in block.items()):
+    for path, values in ((path, values) for block in experiment.sweep for path, values in block.items()):
         section = path.partition(".")[0]
         if section not in SWEPT or section == path:
             faults.append(
@@ -201,19 +191,17 @@ def _faults_of_fields(blocks: Sequence[Mapping[str, Sequence[Any]]]) -> list[str
         texts = [json.dumps(value, sort_keys=True) for value in values]
         again = (text_of(value) for place, value in enumerate(values) if texts[place] in texts[:place])
         faults += [f"sweep.{path}: names the value {text} twice" for text in dict.fromkeys(again)]
+    count = sum(math.prod(len(values) for values in block.values()) for block in experiment.sweep)
+    if count > MOST_POINTS:
+        faults.append(
+            f"sweep: has {count} points, all combinations of the values, and at most {MOST_POINTS} are allowed; give "
+            "fewer values, or a list of blocks that vary one field each"
+        )
+    if not experiment.measures_signal_loss:
+        faults.append(
+            f"sweep: compares the signal loss of its points, which needs the variants {', '.join(SIGNAL_LOSS_VARIANTS)}"
+        )
     return faults
-
-
-def _varied(plain: Mapping[str, Any], changes: Mapping[str, Any], words: str, folder: Path) -> Experiment:
-    """Return the experiment of one point."""
-    data = overridden(plain, changes)
-    data["description"] = f"{plain.get('description', '')} Point of a sweep: {words}.".strip()
-    return validate(data, folder)
-
-
-def varied_fields(block: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Return the fields of a block that have several values; the first if none has."""
-    return [path for path, values in block.items() if len(values) > 1] or list(block)[:1]
 
 
 def _label(number: int, changes: Mapping[str, Any]) -> str:

@@ -45,6 +45,7 @@ from calstudy.validation.steps.single_fit import first_integrations
 from calstudy.verdicts.criterion import AtMost, Finding, Within
 
 HUGE = 1e6
+VARIANT = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
 
 
 class Flags(Step):
@@ -75,8 +76,7 @@ class Flags(Step):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the foregrounds alone, and with gains and noise in both realizations."""
-        variant = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
-        data = {parity: corruption.data(graph, variant, parity) for parity in PARITIES}
+        data = {parity: corruption.data(graph, VARIANT, parity) for parity in PARITIES}
         return {"foregrounds": required(simulation.foregrounds(graph), "foregrounds"), **data}
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
@@ -146,7 +146,6 @@ def bias(even: UVData, odd: UVData) -> Finding:
     return Finding(found.value / found.uncertainty, 1.0)
 
 
-VARIANT = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
 NAMES = ("within_1", "within_2")
 MANY = {"instrument.times.count": 20, "calibration.weights": "gains", "sky.eor.nside": 64}
 FEW = {"instrument.times.count": 12, "calibration.weights": "gains"}
