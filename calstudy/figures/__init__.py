@@ -284,16 +284,9 @@ def figure_task(
     stand_ins: Sequence[str],
     settings: Mapping[str, Any] | None = None,
 ) -> Task:
-    """Return the task that draws a figure.
+    """Return the task that draws a figure of members by label, or of a single run, whose label is empty.
 
-    Parameters
-    ----------
-    members
-        What it is drawn of, by label; a single run has an empty label.
-    stand_ins
-        Printed on the figure if it shows the sky.
-    settings
-        In place of those of the method `settings` of the figure.
+    Stand-ins are printed on it if it shows the sky; `settings` replace those of its own method.
     """
     with guarded(figure):
         own = {label: figure.settings(graph) for label, graph in members.items()} if settings is None else {}

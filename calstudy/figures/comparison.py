@@ -50,8 +50,6 @@ def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[
 
     `cases` are by world and calibrator.
     """
-    from matplotlib.lines import Line2D
-
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
     grid = figure.subplots(len(cases), 2, squeeze=False, sharex=True)
     for (left, right), (world, found) in zip(grid, cases.items(), strict=True):
@@ -69,7 +67,7 @@ def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[
         right.set_ylabel(r"$s^2 P^{R_0} / P^S$")
     for axes in grid[-1]:
         axes.set_xlabel(style.WAVENUMBER)
-    handles = [Line2D([], [], linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
+    handles = [style.entry(linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
     figure.legend(handles, list(calibrators), loc="outside upper center", ncols=min(len(calibrators), 5))
     return figure
 
@@ -129,8 +127,6 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
 
     The calibrators are values of one setting, in order. `cases` are by world and calibrator.
     """
-    from matplotlib.lines import Line2D
-
     worlds = list(cases)
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     figure = style.new_figure(style.TWO_COLUMNS, 4.2)
@@ -151,7 +147,7 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
         lower.set_xticks(range(len(calibrators)), names, fontsize=style.SMALL_SIZE, rotation=90)
     grid[0, 0].set_ylabel(r"$T$, free of the flux scale")
     grid[1, 0].set_ylabel(r"bias $s^2 P^{R_0} / P^S$")
-    handles = [Line2D([], [], linewidth=0.7, **look(place)) for place in range(len(worlds))]
+    handles = [style.entry(linewidth=0.7, **look(place)) for place in range(len(worlds))]
     figure.legend(handles, worlds, loc="outside upper center", ncols=min(len(worlds), 5))
     return figure
 
@@ -203,8 +199,6 @@ def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence
     variant. Open symbols are 95 % upper limits of a bias that is within two standard deviations of zero; crosses are
     cases of which most solves stalled or failed. `cases` are by world and calibrator.
     """
-    from matplotlib.lines import Line2D
-
     worlds, rows = variants(list(cases)), variants(calibrators)
     shown = {
         world: [name for name, labels in rows.items() if _drawn(labels, [cases[label] for label in kinds.values()])]
@@ -225,13 +219,13 @@ def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence
     for band, axes in enumerate(grid[-1]):
         low, high = edges[band : band + 2]
         axes.set_xlabel(rf"bias $s^2\,|P^{{R_0}}| / P^S$, $k = {low:g}$–${high:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
-    handles = [Line2D([], [], color=colour, marker="o", linestyle="", label=name) for name, colour in colours.items()]
+    handles = [style.entry(color=colour, marker="o", linestyle="", label=name) for name, colour in colours.items()]
     handles += [
-        Line2D([], [], color=style.GREY, marker=marker, linestyle="", label=name) for name, marker in markers.items()
+        style.entry(color=style.GREY, marker=marker, linestyle="", label=name) for name, marker in markers.items()
     ]
     handles += [
-        Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit"),
-        Line2D([], [], color=style.GREY, marker="x", linestyle="", label="stalled"),
+        style.entry(color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit"),
+        style.entry(color=style.GREY, marker="x", linestyle="", label="stalled"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     return figure

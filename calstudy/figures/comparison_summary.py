@@ -170,19 +170,10 @@ def draw_tolerances(
 ) -> Figure:
     """Draw the bias on the left and T on the right against the severity of each fault, with 95 % bars.
 
-    Both are in the band of k in which tolerances are judged. The dashed line is the bias that is tolerated.
-
-    Parameters
-    ----------
-    found : the faults
-    cases : by world and calibrator
-    calibrators : their labels, in order
-    eor_level
-        Amplitude of the EoR over that of the foregrounds in dB, to which the bias is relative; None if cases differ in
-        it, or it is not known.
+    Both are in the band of k in which tolerances are judged. The dashed line is the bias that is tolerated. `cases` are
+    by world and calibrator. The level of the EoR, dB of amplitude over the foregrounds, is None if cases differ in it,
+    or it is not known.
     """
-    from matplotlib.lines import Line2D
-
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + FAULT_HEIGHT * len(found))
     grid = figure.subplots(len(found), 2, squeeze=False)
     for (left, right), fault in zip(grid, found, strict=True):
@@ -205,7 +196,7 @@ def draw_tolerances(
     grid[0, 0].set_title(band + level, loc="left")
     scored = {name for found in cases.values() for name in found}
     looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
-    handles = [Line2D([], [], linewidth=0.7, **its) for its in looks.values()]
+    handles = [style.entry(linewidth=0.7, **its) for its in looks.values()]
     figure.legend(handles, list(looks), loc="outside upper center", ncols=min(len(looks), 5))
     return figure
 

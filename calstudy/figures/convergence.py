@@ -60,8 +60,6 @@ def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[in
     """
     from matplotlib.ticker import FuncFormatter
 
-    if not paths:
-        raise ValueError("a figure of convergence has no solver, expected at least one")
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2)
     for path, (marker, colour) in zip(paths, style.SERIES, strict=False):

@@ -219,13 +219,10 @@ def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
-def diagnose(
-    data: UVData, result: CalibrationResult, errors: np.ndarray | None = None, polarization: int = 0
-) -> Diagnostics:
-    """Collect the arrays of the diagnostic figure for one polarization, given by its index.
+def diagnose(data: UVData, result: CalibrationResult, errors: np.ndarray | None) -> Diagnostics:
+    """Collect the arrays of the figure for the first polarization of data and their calibration.
 
-    `data` are those of `calstudy.calibrate.execution.run_calibrator`, and `result` is its result. `errors` are of |g|
-    and of the phase of its gains, (2, Nants, Nfreqs, Ntimes, Npols).
+    `errors` are of |g| and of the phase of the gains, (2, Nants, Nfreqs, Ntimes, Npols).
     """
     from calstudy.realdata.quality import assess
 
@@ -234,16 +231,16 @@ def diagnose(
     lengths = np.linalg.norm(baseline_vectors(model), axis=1)
     order = np.argsort(lengths, kind="stable")
     grid = channel_grid(np.asarray(model.freq_array, float))
-    flags = flag_cube(result.residual)[..., polarization]
-    measured = np.where(flags, 0, to_cube(data)[..., polarization][:, rows])
+    flags = flag_cube(result.residual)[..., 0]
+    measured = np.where(flags, 0, to_cube(data)[..., 0][:, rows])
     spectra = [
         _delay_rms(np.where(flags, 0, cube)[:, order], grid)
-        for cube in (measured, to_cube(model)[..., polarization], to_cube(result.residual)[..., polarization])
+        for cube in (measured, to_cube(model)[..., 0], to_cube(result.residual)[..., 0])
     ]
-    antennas, gains, shown_errors = _shown_gains(result, errors, polarization)
-    number = int(model.polarization_array[polarization])
+    antennas, gains, shown_errors = _shown_gains(result, errors)
+    number = int(model.polarization_array[0])
     records = [record for record in result.solutions if record.polarization == number]
-    quality = assess(data, result, polarization)
+    quality = assess(data, result, 0)
     return Diagnostics(
         polarization=quality.polarization,
         unit=model.vis_units,
@@ -265,21 +262,19 @@ def diagnose(
     )
 
 
-def _shown_gains(
-    result: CalibrationResult, errors: np.ndarray | None, polarization: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _shown_gains(result: CalibrationResult, errors: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return names of antennas with solutions, spread over the array, their gains, NaN where flagged, and errors."""
     gains = result.gains
-    flags = gains.flag_array[..., polarization]
+    flags = gains.flag_array[..., 0]
     used = np.flatnonzero(~flags.all(axis=(1, 2)))
     used = (
         used[np.unique(np.linspace(0, used.size - 1, min(used.size, MAX_ANTENNAS)).astype(int))] if used.size else used
     )
-    values = np.where(flags[used], np.nan, gains.gain_array[used, :, :, polarization])
+    values = np.where(flags[used], np.nan, gains.gain_array[used, :, :, 0])
     times = np.flatnonzero(~flags.all(axis=(0, 1)))
     middle = times[times.size // 2] if times.size else 0
     names = dict(zip(gains.telescope.antenna_numbers.tolist(), gains.telescope.antenna_names, strict=True))
-    found = np.full((2, *values.shape[:2]), np.nan) if errors is None else errors[:, used][..., middle, polarization]
+    found = np.full((2, *values.shape[:2]), np.nan) if errors is None else errors[:, used][..., middle, 0]
     return np.array([str(names[int(number)]) for number in gains.ant_array[used]]), values[:, :, middle], found
 
 

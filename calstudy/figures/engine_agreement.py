@@ -75,14 +75,10 @@ class EngineAgreement:
 def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreement:
     """Compare two simulations of the same sky, beam and observation, in Jy on equally spaced channels.
 
-    Raises InputError if the band leaves no delays beyond the horizon of the longest baseline, and ValueError if the
-    observations differ.
+    Raises InputError if the band leaves no delays beyond the horizon of the longest baseline.
     """
     from calstudy.simulate.floor import delay_floor, floor_buffers
 
-    for name in ("baseline_array", "time_array", "freq_array", "polarization_array"):
-        if not np.array_equal(getattr(foregrounds, name), getattr(reference, name)):
-            raise ValueError(f"the two simulations differ in {name}, expected the same observation")
     buffers = floor_buffers(foregrounds)
     if not buffers:
         raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")

@@ -103,8 +103,6 @@ def draw_gain_tolerance(
     common in part, arrows lower limits. Dotted lines are published tolerances, named on the right. `eor_level` is that
     of the EoR in dB, None if not known.
     """
-    from matplotlib.lines import Line2D
-
     edges = next(iter(worlds.values())).law.bin_edges
     figure = style.new_figure(style.TWO_COLUMNS, HEIGHT)
     panels = figure.subplots(1, edges.size - 1, squeeze=False, sharex=True, sharey=True)[0]
@@ -120,7 +118,7 @@ def draw_gain_tolerance(
     _name(published, panels[-1])
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB"
     panels[0].set_ylabel(f"rms (%) for a bias of {LIMIT:g}{level}")
-    handles = [Line2D([], [], **_look(kind, number), label=_title(kind)) for number, kind in enumerate(kinds)]
+    handles = [style.entry(**_look(kind, number), label=_title(kind)) for number, kind in enumerate(kinds)]
     figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 4))
     return figure
 

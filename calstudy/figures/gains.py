@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 ANTENNA_COLOURS = ((style.BLUE, "#003A5C"), (style.ORANGE, "#7A5300"))
 """Colours of true and of recovered gains, for each antenna."""
+REFLECTIONS = (-1e-6, 4e-6)
+"""Delays at which reflections are shown, s."""
 RATIO_LOOK: dict[str, Any] = {"color": style.BLACK, "linestyle": ":"}
 
 
@@ -50,23 +52,11 @@ class GainComparison:
 def compare_gains(
     antennas: tuple[int, int], frequency: np.ndarray, true: np.ndarray, recovered: np.ndarray, aligned: np.ndarray
 ) -> GainComparison:
-    """Compare true and recovered gains, (2, Nfreqs) complex, on channels `frequency` (Nfreqs,) Hz.
+    """Compare gains of two antennas, (2, Nfreqs) complex, on channels `frequency` (Nfreqs,) Hz.
 
-    Where there is no solution all are zero.
-
-    Parameters
-    ----------
-    antennas : the two antenna numbers
-    frequency : channel centres, Hz, (Nfreqs,)
-    true, recovered, aligned
-        Gains: injected, as fitted, and fitted with the scale and the phase of each channel that come closest to the
-        truth; complex, (2, Nfreqs).
+    They are injected, as fitted, and fitted with the scale and the phase of each channel that come closest to the
+    truth. Where there is no solution all are zero.
     """
-    if any(np.shape(gains) != (2, frequency.size) for gains in (true, recovered, aligned)):
-        raise ValueError(
-            f"gains have shapes {np.shape(true)}, {np.shape(recovered)} and {np.shape(aligned)}, expected two antennas "
-            f"and {frequency.size} channels"
-        )
     products = [gains[0] * np.conj(gains[1]) for gains in (true, recovered)]
     known = products[1] != 0
     ratio = np.divide(products[0], products[1], out=np.ones(frequency.size, complex), where=known) - 1
@@ -118,17 +108,15 @@ def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: 
 
 
 def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
-    from matplotlib.lines import Line2D
-
     names = ("true", "recovered, as fitted", "residual as fitted", "residual aligned")
     handles = [
-        Line2D([], [], label=rf"$g_{{{number}}}$ {name}", **look)
+        style.entry(label=rf"$g_{{{number}}}$ {name}", **look)
         for number, colours in zip(antennas, ANTENNA_COLOURS, strict=True)
         for name, look in zip(names, _looks(*colours), strict=True)
     ]
     a, b = antennas
     ratio = rf"$g_{{{a}}}g_{{{b}}}^*/(\hat{{g}}_{{{a}}}\hat{{g}}_{{{b}}}^*)-1$, as fitted"
-    handles.append(Line2D([], [], label=ratio, **RATIO_LOOK))
+    handles.append(style.entry(label=ratio, **RATIO_LOOK))
     figure.legend(handles=handles, loc="outside upper center", ncols=5, columnspacing=1.1)
 
 
@@ -169,11 +157,11 @@ class Gains(InspectedFigure):
 
 
 @style.journal_style()
-def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6) -> Figure:
+def draw_reflections(gains: TwoDomains) -> Figure:
     """Draw the amplitude of the transform of every antenna's gain, and their median, in one column.
 
-    Gains are (Nants, Nfreqs), see `calstudy.plotting.axes.in_two_domains`. Delays from -max_delay / 4 to max_delay
-    (s) are shown: Eq. REFGAIN has its peaks at positive delays.
+    Gains are (Nants, Nfreqs), see `calstudy.plotting.axes.in_two_domains`. Eq. REFGAIN has its peaks at positive
+    delays.
     """
     amplitude = np.abs(gains.transform)
     figure = style.new_figure(style.ONE_COLUMN, 2.7)
@@ -183,7 +171,7 @@ def draw_reflections(gains: TwoDomains, max_delay: float = 4e-6) -> Figure:
     lines[0].set_label("each antenna")
     axes.plot(nanoseconds, np.median(amplitude, axis=0), color=style.BLACK, label="median")
     delay_panel(axes, gains.delay, r"$|\widetilde{g}(\tau)|$")
-    shown = (gains.delay >= -max_delay / 4) & (gains.delay <= max_delay)
+    shown = (gains.delay >= REFLECTIONS[0]) & (gains.delay <= REFLECTIONS[1])
     # The nulls between the taper's sidelobes would take half of the axis.
     axes.set_ylim(0.3 * np.quantile(amplitude[:, shown], 0.02), 3 * amplitude.max())
     axes.set_xlim(*nanoseconds[shown][[0, -1]])

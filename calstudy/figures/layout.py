@@ -38,12 +38,7 @@ class LayoutPanel:
 
 @style.journal_style()
 def draw_layouts(panels: Sequence[LayoutPanel]) -> Figure:
-    """Draw one or two arrays, east to the right and north up, in equal scales.
-
-    Raise ValueError for another number of panels, or if positions and numbers of a panel do not match.
-    """
-    if len(panels) not in (1, 2):
-        raise ValueError(f"a layout figure has 1 or 2 panels, not {len(panels)}")
+    """Draw one or two arrays, east to the right and north up, in equal scales."""
     width, height = (style.ONE_COLUMN, 3.4) if len(panels) == 1 else (style.TWO_COLUMNS, 3.8)
     figure = style.new_figure(width, height)
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -54,9 +49,7 @@ def draw_layouts(panels: Sequence[LayoutPanel]) -> Figure:
 def _draw_array(axes: Axes, panel: LayoutPanel) -> None:
     from scipy.spatial.distance import pdist
 
-    numbers, east_north = np.asarray(panel.numbers), np.asarray(panel.enu, dtype=float)[:, :2]
-    if numbers.shape != (len(east_north),):
-        raise ValueError(f"layout '{panel.title}': {numbers.size} antenna numbers for {len(east_north)} positions")
+    numbers, east_north = panel.numbers, panel.enu[:, :2]
     limits, extent = _square_limits(east_north)
     axes_points = 72 * 2.7
     spacing = pdist(east_north).min() if len(numbers) > 1 else extent

@@ -12,7 +12,7 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.figures.comparison import look
-from calstudy.figures.spherical import Marking, SphericalColumn, draw_band, draw_points, read_column
+from calstudy.figures.spherical import Marking, SphericalColumn, draw_band, draw_points, read_column, shifted
 from calstudy.plotting import style
 from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
@@ -42,8 +42,6 @@ class MemberBias:
 @style.journal_style()
 def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
     """Draw |bias| against k, or, where it is within its 95 % error, the 95 % upper limit as an open symbol."""
-    from matplotlib.lines import Line2D
-
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     axes = figure.subplots()
     for place, member in enumerate(members.values()):
@@ -60,8 +58,8 @@ def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
     axes.set_yscale("log")
     axes.set_xlabel(style.WAVENUMBER)
     axes.set_ylabel(r"$|s^2 P^{R_0} / P^S|$")
-    handles = [Line2D([], [], linewidth=0.6, **look(place)) for place in range(len(members))]
-    handles.append(Line2D([], [], color=style.GREY, marker="o", markerfacecolor="white", linestyle=""))
+    handles = [style.entry(linewidth=0.6, **look(place)) for place in range(len(members))]
+    handles.append(style.entry(color=style.GREY, marker="o", markerfacecolor="white", linestyle=""))
     figure.legend(handles, [*members, "open: 95 % upper limit"], loc="outside right upper")
     return figure
 
@@ -95,6 +93,8 @@ SOLVERS = (
     Marking("the paper's solver", "D", style.BLUE, 2.5, -0.12),
     Marking("the default solver", "s", style.ORANGE, 2.6, 0.12),
 )
+LAST_K = 1.0
+"""End of the axes of k, h/Mpc."""
 ARRAYS = {
     "Minimally redundant": ("paper_solver", "minimally_redundant"),
     "Redundant": ("redundant_paper_solver", "redundant"),
@@ -103,14 +103,12 @@ ARRAYS = {
 
 
 @style.journal_style()
-def draw_solver_comparison(
-    arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]], last_k: float = 1.0
-) -> Figure:
+def draw_solver_comparison(arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]]) -> Figure:
     """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
 
     Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ; the dotted line
     is 1.96 σ of the thermal noise. `arrays` has, by title, the spectra with the paper's solver and with the default
-    one; power in mK² h⁻³ Mpc³, k in h/Mpc up to `last_k`.
+    one; power in mK² h⁻³ Mpc³, k in h/Mpc.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 5.6)
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
@@ -123,7 +121,7 @@ def draw_solver_comparison(
     shown = [column for solvers in arrays.values() for column in solvers]
     first = min(_first_k(column.eor) for column in shown)
     for row, name in zip(grid, ROWS, strict=True):
-        row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, last_k), ylim=_limits(shown, name, last_k))
+        row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, LAST_K), ylim=_limits(shown, name))
         row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
     _add_legend(figure)
@@ -140,28 +138,27 @@ def _draw_panel(axes: Axes, solvers: Sequence[SphericalColumn], name: str) -> No
 
 def _first_k(spectrum: SphericalSpectrum) -> float:
     """Return the k of the leftmost point, with its shift."""
-    left = spectrum.k + min(marking.shift for marking in SOLVERS) * np.diff(spectrum.bin_edges)
+    left = shifted(spectrum, min(marking.shift for marking in SOLVERS))
     return float(left[np.isfinite(spectrum.power.real)].min())
 
 
-def _limits(shown: Sequence[SphericalColumn], name: str, last_k: float) -> tuple[float, float]:
+def _limits(shown: Sequence[SphericalColumn], name: str) -> tuple[float, float]:
     """Return limits from below the noise to above EoR and residuals."""
     used = [getattr(column, name) for column in shown]
     low = min(np.nanmedian(SIGMAS_95 * spectrum.noise_error) for spectrum in used)
     tops = [np.abs(spectrum.power.real) + SIGMAS_95 * spectrum.error for spectrum in used]
-    highest = max(float(np.nanmax(top[spectrum.k <= last_k])) for top, spectrum in zip(tops, used, strict=True))
+    highest = max(float(np.nanmax(top[spectrum.k <= LAST_K])) for top, spectrum in zip(tops, used, strict=True))
     bands = [column.eor.power.real + SIGMAS_95 * column.eor.error for column in shown]
     return 0.1 * float(low), 2 * max(highest, *(float(np.nanmax(band)) for band in bands))
 
 
 def _add_legend(figure: Figure) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Any] = [marking.handle for marking in SOLVERS]
-    handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
-    handles.append(Line2D([], [], linestyle=":", color=style.GREY, linewidth=0.9))
-    handles.append(Line2D([], [], linestyle="none", **style.OPEN_MARKER))
+    handles.append((Patch(color=style.BAND), style.entry(color=style.GREY, linewidth=0.7)))
+    handles.append(style.entry(linestyle=":", color=style.GREY, linewidth=0.9))
+    handles.append(style.entry(linestyle="none", **style.OPEN_MARKER))
     labels = [*(marking.label for marking in SOLVERS), r"$P^{S}$, 95% sample variance"]
     labels += [r"thermal noise, 95%", r"open: $P < 0$"]
     figure.legend(handles, labels, loc="outside upper center", ncols=5, columnspacing=1.0, handletextpad=0.3)

@@ -9,7 +9,7 @@ import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.signal_loss import TRANSFER, SignalLoss, draw_map, draw_transfer
+from calstudy.figures.signal_loss import SignalLoss, draw_loss
 from calstudy.figures.spherical import Marking, draw_points, magnitudes
 from calstudy.figures.wedge import draw_wedge
 from calstudy.plotting import style
@@ -22,7 +22,6 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from calstudy.power.spectra import SphericalSpectrum
@@ -49,7 +48,8 @@ def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer
     for axes, (modes, series) in zip(grid, columns.items(), strict=True):
         for place, (name, marking) in enumerate(MARKINGS.items()):
             draw_points(axes, series[name], marking, name, 2 + place)
-        _draw_noise(axes, series["residual"])
+        residual, known = series["residual"], np.isfinite(series["residual"].noise_error)
+        axes.plot(residual.k[known], residual.noise_error[known], color=style.GREY, linewidth=0.9, zorder=1)
         axes.set_title(COLUMNS[modes].format(1e9 * buffer))
         axes.set(xlabel=style.WAVENUMBER, xscale="log", yscale="log", ylim=_limits(columns))
         style.label_one_two_five(axes.xaxis)
@@ -62,11 +62,6 @@ def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer
     handles.append(axes.plot([], [], linestyle="none", label=r"open: $P < 0$", **style.OPEN_MARKER)[0])
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     return figure
-
-
-def _draw_noise(axes: Axes, residual: SphericalSpectrum) -> None:
-    known = np.isfinite(residual.noise_error)
-    axes.plot(residual.k[known], residual.noise_error[known], color=style.GREY, linewidth=0.9, zorder=1)
 
 
 def _limits(columns: Mapping[str, Mapping[str, SphericalSpectrum]]) -> tuple[float, float]:
@@ -107,7 +102,6 @@ TITLES = {
     "residual": "residual",
     "noise": r"noise, $P_N$",
 }
-MAX_DELAY = 2e-6
 
 
 class ObservedWedge(StudyFigure):
@@ -130,7 +124,7 @@ class ObservedWedge(StudyFigure):
         """Draw a panel for each spectrum."""
         tables = Tables((job.inputs["spectra"],))
         found = {name: tables.wedge(name) for name in TITLES}
-        figure = draw_wedge(found, TITLES, job.settings["wedge_buffer"], MAX_DELAY)
+        figure = draw_wedge(found, TITLES, job.settings["wedge_buffer"])
         return Drawing(figure, found)
 
 
@@ -140,18 +134,13 @@ def draw_observed_loss(loss: SignalLoss, buffer: float) -> Figure:
 
     Bars are 95 % (1.96 sigma). The dashed line is the horizon plus `buffer`, s.
     """
-    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
-    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
-    left.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
     where = f"wedge + {1e9 * buffer:.0f} ns"
-    draw_transfer(left, loss.outside, f"injected, outside {where}", "o", style.BLUE)
-    draw_transfer(left, loss.inside, f"injected, inside {where}", "s", style.ORANGE)
+    figure, axes = draw_loss(loss, f"injected, {{}} {where}", buffer)
     if loss.expected is not None:
         label = f"expected of the fit, outside {where}"
-        left.plot(loss.expected.k, loss.expected.outside, color=style.BLUE, linewidth=0.9, label=label)
-    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, loss.last_k), ylim=(-0.03, 1.15))
-    left.legend(loc="lower right")
-    draw_map(figure, right, loss.map, buffer, MAX_DELAY)
+        axes.plot(loss.expected.k, loss.expected.outside, color=style.BLUE, linewidth=0.9, label=label)
+    axes.set_ylim(-0.03, 1.15)
+    axes.legend(loc="lower right")
     return figure
 
 

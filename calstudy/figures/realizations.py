@@ -15,6 +15,7 @@ from calstudy.base.units import Wavenumber
 from calstudy.experiment.realizations import described
 from calstudy.figures import TWO_ARRAYS, Drawing, StudyFigure, members_of
 from calstudy.figures.signal_loss import TRANSFER
+from calstudy.figures.spherical import shifted
 from calstudy.plotting import style
 from calstudy.power.realizations import Design, Pooled, PooledRegion, mean_over_bins, pool_region, together
 from calstudy.power.tables import write_columns
@@ -67,13 +68,17 @@ def draw_realizations(
 def _draw_transfer(axes: Axes, results: Mapping[str, RegionResults]) -> None:
     """Draw mean T with the scatter of one realization as bars."""
     for region, marker, colour in ((OUTSIDE, "o", style.BLUE), (INSIDE, "s", style.ORANGE)):
-        pooled = results[region].pooled
-        total = pooled.total["transfer"]
-        label = region.replace("-", " the ")
-        axes.errorbar(pooled.k, total.mean, total.scatter, fmt=marker, color=colour, elinewidth=0.7, label=label)
+        look = {"fmt": marker, "color": colour, "label": region.replace("-", " the ")}
+        _draw_scatter(axes, results[region].pooled, "transfer", 0.0, look)
     axes.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
     axes.set_ylabel(TRANSFER)
     axes.legend(loc="center right", title="bars: scatter", title_fontsize=style.SMALL_SIZE)
+
+
+def _draw_scatter(axes: Axes, pooled: PooledRegion, name: str, shift: float, look: Mapping[str, Any]) -> None:
+    """Draw the mean of a quantity with the scatter of one realization as bars."""
+    total = pooled.total[name]
+    axes.errorbar(shifted(pooled, shift), total.mean, total.scatter, elinewidth=0.7, **look)
 
 
 def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> None:
@@ -105,10 +110,8 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
     """Draw the mean and the scatter of the pulls of P^R, and the mean of those of P^R / T."""
     pooled = results.pooled
     for kind, (marker, colour, name, shift) in KINDS.items():
-        total = pooled.total[f"pull_{kind}"]
-        k = pooled.k + shift * np.diff(pooled.bin_edges)
-        label = rf"$(P^R - {name})/\sigma$"
-        axes.errorbar(k, total.mean, total.scatter, fmt=marker, color=colour, elinewidth=0.7, label=label)
+        look = {"fmt": marker, "color": colour, "label": rf"$(P^R - {name})/\sigma$"}
+        _draw_scatter(axes, pooled, f"pull_{kind}", shift, look)
     if results.corrected is not None:
         known = np.isfinite(results.corrected.power).all(axis=0)
         deviations = (results.corrected.power - results.eor)[:, known]
@@ -127,7 +130,7 @@ def _draw_coverage(axes: Axes, results: RegionResults) -> None:
     """Draw the part of independent draws whose 95 % bars cover, per bin; filled: of P^R / T."""
     pooled = results.pooled
     for kind, (marker, colour, name, shift) in KINDS.items():
-        k = pooled.k + shift * np.diff(pooled.bin_edges)
+        k = shifted(pooled, shift)
         for prefix, filled, power in (("", "none", "P^R"), ("corrected_", colour, "P^R/T")):
             inside = results.trials(prefix + kind)
             if inside is None:
@@ -149,9 +152,8 @@ def _draw_corrected(axes: Axes, results: RegionResults) -> None:
     for name, (power, colour, marker, shift) in powers.items():
         found = [mean_over_bins(column[:, None], pooled.design) for column in (power / results.put_in).T]
         mean, error = np.transpose([(item.value, item.uncertainty) for item in found])
-        k = pooled.k + shift * np.diff(pooled.bin_edges)
-        label = f"${name}$ over input"
-        axes.errorbar(k, mean, SIGMAS_95 * error, fmt=marker, color=colour, elinewidth=0.7, label=label)
+        look: dict[str, Any] = {"fmt": marker, "color": colour, "label": f"${name}$ over input"}
+        axes.errorbar(shifted(pooled, shift), mean, SIGMAS_95 * error, elinewidth=0.7, **look)
     axes.axhline(1, color=style.BLACK, linewidth=0.7, zorder=0)
     axes.set(ylabel="mean over the input, 95 %", ylim=(0, max(1.35, axes.get_ylim()[1])))
     _legend_above(axes, 1)
@@ -241,9 +243,7 @@ def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_
     figure = style.new_figure(style.ONE_COLUMN, 4.2)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     for shift, (marker, colour), (title, pooled) in zip((-0.15, 0.15), SERIES, arrays.items(), strict=True):
-        total = pooled.total["transfer"]
-        k = pooled.k + shift * np.diff(pooled.bin_edges)
-        upper.errorbar(k, total.mean, total.scatter, fmt=marker, color=colour, elinewidth=0.7, label=title)
+        _draw_scatter(upper, pooled, "transfer", shift, {"fmt": marker, "color": colour, "label": title})
     upper.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
     upper.set_ylabel(TRANSFER)
     upper.legend(loc="lower right", title="bars: scatter of one realization", title_fontsize=style.SMALL_SIZE)

@@ -30,8 +30,6 @@ SHOWN = {
 """Labels of the timings that the figures show."""
 AXES = {"rows": ("number of antennas", r"N_\mathrm{ant}"), "line": ("longest baseline (m)", r"b_\mathrm{max}")}
 CLOCKS = {"cpu": "one core", "gpu": "GPU"}
-MOST = 2 * len(COLOURS)
-"""Largest number of series in one figure; the second four have open markers and broken lines."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +64,10 @@ def draw_runtime(
 ) -> Figure:
     r"""Draw medians (markers), 95 % bands and fitted power laws (lines) on logarithmic axes, in one column.
 
-    There are one to eight series. `size_label` and `time_label` include the unit, such as ``"longest baseline (m)"``;
-    `symbol` is the size in mathematical notation, for the fits in the legend: ``r"N_\mathrm{ant}"``.
+    There are up to eight series, of which the second four have open markers and broken lines. `size_label` and
+    `time_label` include the unit, such as ``"longest baseline (m)"``; `symbol` is the size in mathematical notation,
+    for the fits in the legend: ``r"N_\mathrm{ant}"``.
     """
-    if not 1 <= len(series) <= MOST:
-        raise ValueError(f"a run-time figure has 1 to {MOST} series, not {len(series)}")
     figure = style.new_figure(style.ONE_COLUMN, 2.7 + 0.14 * len(series))
     axes = figure.subplots()
     for index, item in enumerate(series):

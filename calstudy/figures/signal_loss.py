@@ -60,30 +60,15 @@ class SignalLoss:
 
 
 @style.journal_style()
-def draw_signal_loss(loss: SignalLoss, buffer: float = 100e-9, max_delay: float | None = 2e-6) -> Figure:
+def draw_signal_loss(loss: SignalLoss, buffer: float = 100e-9) -> Figure:
     """Draw T per |k| outside and inside the wedge on the left, per (|b|, tau) on the right.
 
     Bars are 95 % (1.96 sigma); a point without an error (one baseline in its bin) has none. The dashed line is the
-    horizon plus `buffer`, s. The delay axis ends at `max_delay`, s, if that is not None and within the delays. Raise
-    ValueError if no bin has a transfer function.
+    horizon plus `buffer`, s. Raise ValueError if no bin has a transfer function.
     """
     if not any(np.isfinite(part.transfer).any() for part in (loss.outside, loss.inside)):
         raise ValueError("no bin of |k| has a transfer function, expected at least one with modes in it")
-    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
-    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
-    _draw_per_k(left, loss, buffer)
-    draw_map(figure, right, loss.map, buffer, max_delay)
-    return figure
-
-
-def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
-    axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
-    where = f"wedge + {1e9 * buffer:.0f} ns"
-    for part, label, marker, colour in (
-        (loss.outside, f"outside {where}", "o", style.BLUE),
-        (loss.inside, f"inside {where}", "s", style.ORANGE),
-    ):
-        draw_transfer(axes, part, label, marker, colour)
+    figure, axes = draw_loss(loss, f"{{}} wedge + {1e9 * buffer:.0f} ns", buffer)
     axes.plot(
         loss.outside.k,
         loss.outside.scale_free_transfer,
@@ -92,10 +77,26 @@ def _draw_per_k(axes: Axes, loss: SignalLoss, buffer: float) -> None:
         zorder=1,
         label=SCALE_FREE.format(loss.outside.flux_scale),
     )
-    axes.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, loss.last_k), ylim=_limits(loss))
+    axes.set_ylim(_limits(loss))
     handles, labels = axes.get_legend_handles_labels()
     # The points, which matter most, come first in the legend; the line would by default.
     axes.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="center right")
+    return figure
+
+
+def draw_loss(loss: SignalLoss, label: str, buffer: float) -> tuple[Figure, Axes]:
+    """Draw a figure of T per |k| on the left and per (|b|, tau) on the right, and return it with the axes on the left.
+
+    `label` has a place for "outside" or "inside"; `buffer` is as for `draw_signal_loss`.
+    """
+    figure = style.new_figure(style.TWO_COLUMNS, 3.0)
+    left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
+    left.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
+    draw_transfer(left, loss.outside, label.format("outside"), "o", style.BLUE)
+    draw_transfer(left, loss.inside, label.format("inside"), "s", style.ORANGE)
+    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, loss.last_k))
+    _draw_map(figure, right, loss.map, buffer)
+    return figure, left
 
 
 def draw_transfer(axes: Axes, part: TransferFunction, label: str, marker: str, colour: str) -> None:
@@ -119,8 +120,7 @@ def _limits(loss: SignalLoss) -> tuple[float, float]:
     return min(-0.03, 1.1 * float(np.nanmin(values))), max(1.1, 1.05 * float(np.nanmax(values)))
 
 
-def draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, max_delay: float | None) -> None:
-    """Draw T per baseline length and delay, with its colour bar; parameters are as for `draw_signal_loss`."""
+def _draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -129,7 +129,7 @@ def draw_map(figure: Figure, axes: Axes, transfer: TransferMap, buffer: float, m
     axes.set_facecolor(EMPTY)
     axes.pcolormesh(x, y, np.ma.masked_invalid(values), norm=norm, cmap=MAP_COLOURS, rasterized=True)
     draw_horizon(axes, transfer, buffer, colour="white")
-    label_axes(axes, transfer, max_delay)
+    label_axes(axes, transfer)
     axes.set_ylabel(style.K_PARALLEL)
     delay_axis(axes, transfer)
     bar = figure.colorbar(ScalarMappable(norm, MAP_COLOURS), ax=axes, extend="max", pad=0.02, aspect=25)

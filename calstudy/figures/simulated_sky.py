@@ -21,7 +21,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
 from calstudy.plotting import style
-from calstudy.plotting.axes import cells, draw_horizon, label_axes
+from calstudy.plotting.axes import MAX_DELAY, cells, draw_horizon, label_axes
 from calstudy.power.binned import cylindrical_average, spherical_average, with_errors
 from calstudy.power.cosmology import input_power
 from calstudy.power.delay import delay_transform, delays, horizon_delay
@@ -44,6 +44,8 @@ BINS = 12
 POINTS_PER_BIN = 50
 AREA_NSIDE = 128
 TOLERANCE = 0.05
+FAINT, BRIGHT = 0.1, 4.0
+"""Flux densities at 200 MHz, Jy, between which sources are counted."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,8 @@ class SourceCounts:
         return np.sqrt(self.expected) / self.expected
 
 
-def count_sources(sky: SkyModel, faint: float = 0.1, bright: float = 4.0) -> SourceCounts:
-    """Count the point sources between two flux densities (Jy at 200 MHz), in bins of equal logarithmic width.
-
-    Flat spectra are counted at their constant flux density.
-    """
+def count_sources(sky: SkyModel) -> SourceCounts:
+    """Count point sources in bins of equal logarithmic width; those with flat spectra at their flux density."""
     from astropy import units
 
     from calstudy.sky.foregrounds import in_complete_area
@@ -93,8 +92,8 @@ def count_sources(sky: SkyModel, faint: float = 0.1, bright: float = 4.0) -> Sou
         sky = sky.at_frequencies(np.array([FREQUENCY]) * units.Hz, inplace=False, run_check=False)
     flux = sky.stokes[0, 0].to_value("Jy")
     inside = in_complete_area(sky.skycoord)
-    edges = np.geomspace(faint, bright, BINS + 1)
-    fine = np.geomspace(faint, bright, BINS * POINTS_PER_BIN + 1)
+    edges = np.geomspace(FAINT, BRIGHT, BINS + 1)
+    fine = np.geomspace(FAINT, BRIGHT, BINS * POINTS_PER_BIN + 1)
     density = differential_counts(fine)
     steps = np.diff(fine) * (density[:-1] + density[1:]) / 2
     area = _area()
@@ -162,7 +161,6 @@ class SourceCountsFigure(StudyFigure):
 
 LENGTHS = (0.0, 0.5, 1.0)
 """The baselines that are shown, as quantiles of length: shortest, median, longest."""
-MAX_DELAY = 2e-6
 WAVENUMBERS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, np.inf)
 """Limits of the ranges of k, h/Mpc, for which the notes have a ratio."""
 
@@ -288,7 +286,7 @@ def _draw_wedge(figure: Figure, axes: Axes, components: SimulatedComponents) -> 
     filled = np.ma.maximum(np.ma.masked_invalid(power), lowest)
     mesh = axes.pcolormesh(x, y, filled, norm=norm, cmap=colour_map(POSITIVE), rasterized=True)
     draw_horizon(axes, components.wedge, components.buffer)
-    label_axes(axes, components.wedge, MAX_DELAY)
+    label_axes(axes, components.wedge)
     axes.set_ylabel(style.K_PARALLEL)
     axes.legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
     bar = figure.colorbar(mesh, ax=axes, pad=0.02)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
     from calstudy.experiment.model import Experiment
+    from calstudy.power.realizations import PooledRegion
     from calstudy.power.spectra import SphericalSpectrum
     from calstudy.products.graph import Graph
 
@@ -60,9 +61,7 @@ class Marking(NamedTuple):
     @property
     def handle(self) -> Line2D:
         """Its entry of a legend, a little larger than in the figure."""
-        from matplotlib.lines import Line2D
-
-        return Line2D([], [], linestyle="none", marker=self.marker, color=self.colour, markersize=self.size + 0.8)
+        return style.entry(linestyle="none", marker=self.marker, color=self.colour, markersize=self.size + 0.8)
 
 
 MARKINGS = {
@@ -75,24 +74,22 @@ MARKINGS = {
 """Series in the order of drawing, the later over the earlier."""
 LEGEND_ORDER = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "noise")
 ZOOMED = ("residual", "residual_without_eor", "noise")
+ZOOM_K = 1.0
+"""Series of the lower row, and where it ends, h/Mpc."""
 PUBLISHED = "published"
 LIMIT_MARKERS = ("v", "1", "$\\downarrow$", "P", "X", "*")
 
 
 @style.journal_style()
-def draw_spherical(
-    columns: Sequence[SphericalColumn], zoom_k: float = 1.0, limits: Sequence[Limits] = (), z: float = math.nan
-) -> Figure:
+def draw_spherical(columns: Sequence[SphericalColumn], limits: Sequence[Limits] = (), z: float = math.nan) -> Figure:
     """Draw spherical power spectra: full range above, signal and residuals enlarged below.
 
     Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
     or two columns, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone (Fig.
-    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³; the lower row ends at `zoom_k`, h/Mpc. Published limits are drawn
-    above only; `z` is the redshift of the spectra, which is shown beside theirs. Raise ValueError for another number of
-    columns, a spectrum without any power, or a power without an error bar.
+    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³. Published limits are drawn above only; `z` is the redshift of the
+    spectra, which is shown beside theirs. Raise ValueError for a spectrum without any power, or a power without an
+    error bar.
     """
-    if len(columns) not in (1, 2):
-        raise ValueError(f"a spherical figure has 1 or 2 columns, not {len(columns)}")
     for column in columns:
         _check(column)
     width = style.ONE_COLUMN if len(columns) == 1 else style.TWO_COLUMNS
@@ -105,8 +102,8 @@ def draw_spherical(
         top.set_title(column.title)
         bottom.set_xlabel(style.WAVENUMBER)
     first, last = _k_limits(columns)
-    zoomed_last = min(last, zoom_k)
-    for row, ylim, end in zip(grid, (_full_limits(columns), _zoom_limits(columns)), (last, zoomed_last), strict=True):
+    ends = last, min(last, ZOOM_K)
+    for row, ylim, end in zip(grid, (_full_limits(columns), _zoom_limits(columns)), ends, strict=True):
         row[0].set(xscale="log", yscale="log", ylim=ylim, xlim=(first, end))
         row[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
@@ -155,7 +152,7 @@ def draw_band(axes: Axes, eor: SphericalSpectrum) -> None:
 def draw_points(axes: Axes, spectrum: SphericalSpectrum, marking: Marking, name: str, zorder: float) -> None:
     """Draw |P| with 95 % bars on a logarithmic axis, open where P is negative; `name` labels the artists."""
     power = spectrum.power.real
-    k = _shifted(spectrum, marking.shift)
+    k = shifted(spectrum, marking.shift)
     for negative in (False, True):
         chosen = np.isfinite(power) & ((power < 0) == negative)
         axes.errorbar(
@@ -198,7 +195,8 @@ def _zoom_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
     return 0.1 * float(low), 2 * float(max(*(np.nanmax(band) for band in bands), *residuals, low))
 
 
-def _shifted(spectrum: SphericalSpectrum, shift: float) -> np.ndarray:
+def shifted(spectrum: SphericalSpectrum | PooledRegion, shift: float) -> np.ndarray:
+    """Return the centres of bins, moved sideways by a part of their widths."""
     return spectrum.k + shift * np.diff(spectrum.bin_edges)
 
 
@@ -206,15 +204,14 @@ def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
     """Return limits that hold all drawn points, including shifted ones."""
     reach = max(abs(marking.shift) for marking in MARKINGS.values())
     spectra = [(item, np.isfinite(item.power.real)) for item in _present(columns, ("eor", *MARKINGS))]
-    first = min(_shifted(item, -reach)[finite].min() for item, finite in spectra if finite.any())
-    last = max(_shifted(item, reach)[finite].max() for item, finite in spectra if finite.any())
+    first = min(shifted(item, -reach)[finite].min() for item, finite in spectra if finite.any())
+    last = max(shifted(item, reach)[finite].max() for item, finite in spectra if finite.any())
     return 0.85 * float(first), 1.1 * float(last)
 
 
 def _add_legend(
     figure: Figure, columns: Sequence[SphericalColumn], limits: Sequence[Line2D], title: str | None
 ) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Any] = []
@@ -223,9 +220,9 @@ def _add_legend(
         if _present(columns, (name,)):
             handles.append(MARKINGS[name].handle)
             labels.append(MARKINGS[name].label)
-    handles.append((Patch(color=style.BAND), Line2D([], [], color=style.GREY, linewidth=0.7)))
+    handles.append((Patch(color=style.BAND), style.entry(color=style.GREY, linewidth=0.7)))
     labels.append(r"$P^{S}$, 95% sample variance")
-    handles.append(Line2D([], [], linestyle="none", **style.OPEN_MARKER))
+    handles.append(style.entry(linestyle="none", **style.OPEN_MARKER))
     labels.append(r"open: $P < 0$")
     spacing: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
     ncols = 7 if len(columns) == 2 else 3

@@ -54,13 +54,9 @@ def draw_sweep(panels: Sequence[SweepPanel]) -> Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 
     Dashes are T free of the flux scale, which is written above each value (see `calstudy.power.transfer`). There are at
-    most five bands of k. Raise ValueError if there is no panel, or the transfer functions have different bands.
+    most five bands of k, the same in all panels.
     """
-    if not panels:
-        raise ValueError("a figure of a sweep has no panel, expected at least one")
     edges = panels[0].transfers[0].bin_edges
-    if any(not np.array_equal(item.bin_edges, edges) for panel in panels for item in panel.transfers):
-        raise ValueError("the transfer functions of a sweep have different bands of k, expected the same")
     columns = min(COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     width = style.ONE_COLUMN if columns == 1 else style.TWO_COLUMNS
@@ -119,15 +115,13 @@ def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
 
 
 def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> None:
-    from matplotlib.lines import Line2D
-
     labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
     handles: list[Any] = [
         axes.errorbar([], [], yerr=[], fmt=marker, color=colour, elinewidth=0.7)
         for (marker, colour), _ in zip(style.SERIES, labels, strict=False)
     ]
     labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
-    handles.append(Line2D([], [], color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
+    handles.append(style.entry(color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
     labels.append("free of the flux scale $s$")
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
 

@@ -197,12 +197,7 @@ LINES: dict[str, tuple[str, dict[str, Any]]] = {
 
 @style.journal_style()
 def draw_baselines(baselines: Sequence[BaselineSpectra]) -> Figure:
-    """Draw one panel per baseline, at least one, on common axes, with the edges of the wedge.
-
-    A single baseline fills one column.
-    """
-    if not baselines:
-        raise ValueError("a figure of baselines needs at least one baseline")
+    """Draw one panel per baseline on common axes, with the edges of the wedge; a single one fills one column."""
     n_columns = min(2, len(baselines))
     n_rows = -(-len(baselines) // n_columns)
     width = style.ONE_COLUMN if n_columns == 1 else style.TWO_COLUMNS
@@ -235,14 +230,6 @@ def _draw_baseline(axes: Axes, spectra: BaselineSpectra) -> None:
 
 SHOWN_BASELINES = 4
 """Number of baselines in the figure where the experiment names none."""
-
-
-def rms_over_time(spectra: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Return the rms over integrations of the Blackman-Harris delay transforms, real, (..., Ndelays), Jy Hz.
-
-    Spectra are visibilities in Jy, (..., Ntimes, Nfreqs); frequencies are channel centres in Hz, (Nfreqs,).
-    """
-    return np.sqrt(np.mean(np.abs(delay_transform(spectra, frequency, TAPER)) ** 2, axis=-2))
 
 
 class Baselines(StudyFigure):
@@ -288,7 +275,8 @@ class Baselines(StudyFigure):
         measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]
         spectra |= {name: read_spectra(job.inputs[name] / DATA, pairs) for name in measured}
         used = read_used(job.inputs["calibration"] / RESIDUAL, pairs)
-        shown = {name: rms_over_time(used * values, gains.frequency) for name, values in spectra.items()}
+        transforms = {name: delay_transform(used * values, gains.frequency, TAPER) for name, values in spectra.items()}
+        shown = {name: np.sqrt(np.mean(np.abs(values) ** 2, axis=-2)) for name, values in transforms.items()}
         delay = delays(gains.frequency.size, channel_width(gains.frequency))
         panels = [
             BaselineSpectra(pair, length, delay, **{name: values[index] for name, values in shown.items()})

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 
 TAPER = "blackman-harris"
+MAX_DELAY = 2e-6
+"""Largest delay that is drawn, s, if the data have it."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +90,6 @@ def name_baseline(axes: Axes, antennas: tuple[int, int], baseline_length: float)
 Cylinder: TypeAlias = "CylindricalSpectrum | TransferMap"
 
 
-def length_cells(cylinder: Cylinder) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edges (M + 1,) in m of contiguous cells, and the cell of each bin of lengths, (Nb,) int.
-
-    Cells between bins that are not adjacent contain no baselines.
-    """
-    edges = np.unique(cylinder.bin_edges)
-    return edges, np.searchsorted(edges, cylinder.bin_edges[:, 0])
-
-
 def delay_edges(centres: np.ndarray) -> np.ndarray:
     """Return the (N + 1,) edges halfway between (N,) increasing centres >= 0; none is below 0."""
     middle = (centres[1:] + centres[:-1]) / 2
@@ -105,9 +98,10 @@ def delay_edges(centres: np.ndarray) -> np.ndarray:
 
 def cells(cylinder: Cylinder, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return edges in k_perp and k_parallel, and the values (Nb, Nd) on them with NaN where there are no baselines."""
-    lengths, filled = length_cells(cylinder)
+    lengths = np.unique(cylinder.bin_edges)
+    # There are cells between bins of lengths that are not adjacent.
     grid = np.full((cylinder.delay.size, lengths.size - 1), np.nan)
-    grid[:, filled] = values.T
+    grid[:, np.searchsorted(lengths, cylinder.bin_edges[:, 0])] = values.T
     return lengths * ratio(cylinder.k_perp, cylinder.baseline_length), delay_edges(cylinder.k_parallel), grid
 
 
@@ -138,15 +132,13 @@ def _scaled_by(factor: float) -> tuple[Callable[[ArrayLike], np.ndarray], Callab
     return forward, inverse
 
 
-def label_axes(axes: Axes, cylinder: Cylinder, max_delay: float | None) -> None:
-    """Set limits and label k_perp (h/Mpc) below and metres above; delays end at `max_delay` (s), if it is not None."""
+def label_axes(axes: Axes, cylinder: Cylinder) -> None:
+    """Set limits, with delays up to `MAX_DELAY`, and label k_perp (h/Mpc) below and metres above."""
     from matplotlib.ticker import MaxNLocator
 
     metres = ratio(cylinder.baseline_length, cylinder.k_perp)
     shortest, longest = cylinder.bin_edges[[0, -1], [0, 1]]
-    top = delay_edges(cylinder.k_parallel)[-1]
-    if max_delay is not None:
-        top = min(top, max_delay * ratio(cylinder.k_parallel, cylinder.delay))
+    top = min(delay_edges(cylinder.k_parallel)[-1], MAX_DELAY * ratio(cylinder.k_parallel, cylinder.delay))
     axes.set(xlim=(shortest / metres, longest / metres), ylim=(0, top), xlabel=style.K_PERPENDICULAR)
     axes.tick_params(which="both", top=False, right=False, direction="out")
     axes.locator_params(axis="x", nbins=3)

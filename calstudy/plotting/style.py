@@ -19,6 +19,7 @@ from calstudy.base.files import replacing
 if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
     from matplotlib.text import Text
 
 
@@ -122,6 +123,13 @@ def label_one_two_five(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def entry(**look: Any) -> Line2D:
+    """Return a line that is drawn in a legend alone."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], **look)
+
+
 def note_stand_ins(figure: Figure, stand_ins: Sequence[str]) -> Text | None:
     """Print the substitutes for the paper's inputs as one small grey line below the axes, and return the text.
 
@@ -143,18 +151,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def figure_arrays(data: Any) -> dict[str, np.ndarray]:
-    """Return every array in a figure's data by name.
+    """Return every array of nested dataclasses, mappings and sequences by its path, ``"excised.residual.power"``.
 
-    Raises ValueError if a value is neither an array, a number, a string nor None.
-
-    Parameters
-    ----------
-    data : dataclasses, mappings and sequences, nested, that contain arrays, numbers and strings; None means absent
-
-    Returns
-    -------
-    Arrays by the path that leads to them, joined by dots: ``"excised.residual.power"``. A field of a dataclass may have
-    another name there, under ``array`` in its metadata, so that published arrays keep their names.
+    None means absent; raises ValueError for other values than arrays, numbers and strings. A field of a dataclass may
+    have another name there, under ``array`` in its metadata, so that published arrays keep their names.
     """
     arrays: dict[str, np.ndarray] = {}
     _collect("", data, arrays)
@@ -190,14 +190,8 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
     """Write ``name.npz``, ``name.pdf`` and ``name.png`` (200 dpi) into `directory`, and return the three paths.
 
     Each file is written completely or not at all, and replaces an older one. The same figure and arrays give the same
-    bytes: no dates are written. Raises ValueError if the name is not a plain file name, or an array is not plain, and
-    OSError if the directory cannot be written.
-
-    Parameters
-    ----------
-    arrays : plain arrays (numbers, booleans, strings) by name; see `figure_arrays`
-    directory : created if it does not exist
-    name : file name without extension: letters, digits, ``.``, ``_`` and ``-``
+    bytes: no dates are written. Raises ValueError if the name has other characters than letters, digits, ``.``, ``_``
+    and ``-``, or an array (`figure_arrays`) is not plain, and OSError if the directory cannot be made or written.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"figure name '{name}' is not a file name: use letters, digits, '.', '_' and '-'")

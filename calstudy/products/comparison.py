@@ -55,16 +55,10 @@ def case_name(world: int, calibrator: int) -> str:
 
 
 def comparison(title: str, labels: Mapping[str, Any], scores: Mapping[str, Any], notes: Sequence[str]) -> Task:
-    """Return the task of the table.
+    """Return the task of the table, of scores by `case_name`; the notes name what stands in for papers' ingredients.
 
-    Parameters
-    ----------
-    title : name of the study
-    labels
-        ``calibrators`` and ``worlds`` in order, ``fields`` that each world changes with their values, and ``refusals``:
-        world, calibrator and why it cannot work there
-    scores : of all other cases, by `case_name`
-    notes : what stands in for the papers' own ingredients
+    Labels are ``calibrators`` and ``worlds`` in order, ``fields`` that each world changes with their values, and
+    ``refusals``: world, calibrator and why it cannot work there.
     """
     powers = {f"{case}:{name}": task.inputs[name] for case, task in scores.items() for name in SPECTRA}
     # All cases are measured alike.
@@ -298,12 +292,7 @@ def _sky_models(found: Mapping[str, Case]) -> str:
 
 
 def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return the scores of one world as a table, a row for each calibrator.
-
-    Parameters
-    ----------
-    found : contents of score.json by calibrator
-    """
+    """Return the scores of one world, contents of score.json by calibrator, as a table with a row for each."""
     bands = [band["k"] for band in next(iter(found.values()))["bands"]]
     measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
     cost = ("CPU s per integration", "memory")

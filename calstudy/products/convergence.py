@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.errors import InputError
-from calstudy.base.observation import Observation
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.agreement import Baselines, Realization, cross_power
 from calstudy.calibrate.cost import ADAMAX_STEP, PAPER_SAMPLES
-from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.problem import gain_products
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
+from calstudy.products.calibration import prepared_fit
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import DATA, VISIBILITIES, read_visibilities, write_json
+from calstudy.products.files import DATA, VISIBILITIES, integration_times, read_visibilities, write_json
 from calstudy.products.graph import Graph, size_of
 from calstudy.run.task import Input, Inputs, Task
 
@@ -108,21 +107,16 @@ class Convergence(Task, stage="convergence", version=4):
     def _solved(self, parity: str) -> tuple[Realization, list[Checkpoint], Baselines]:
         """Return a realization, the states of the solver after the numbers of steps, and the baselines."""
         from calstudy.calibrate.calamity import make_solver
-        from calstudy.calibrate.preparation import make_problem, prepare
+        from calstudy.calibrate.preparation import make_problem
         from calstudy.calibrate.solvers.interface import trace
         from calstudy.products.selection import read_gains
 
         settings = self.calibration
         index = self.integration
-        data = read_visibilities(self.data[f"data {parity}"] / DATA)
-        chosen = np.arange(index * data.Nbls, (index + 1) * data.Nbls)
-        data = data.select(blt_inds=chosen, inplace=False, run_check=False)
-        sky = None
-        if self.sky_model is not None:
-            sky = read_visibilities(self.sky_model / VISIBILITIES)
-            sky = sky.select(blt_inds=chosen, inplace=False, run_check=False)
-        assumed = Assumed(None if sky is None else Observation(sky))
-        prepared = prepare(Observation(data), settings, assumed)
+        path = self.data[f"data {parity}"] / DATA
+        times = integration_times(path)[[index]]
+        sky = None if self.sky_model is None else read_visibilities(self.sky_model / VISIBILITIES, times)
+        prepared = prepared_fit(settings, read_visibilities(path, times), sky, None)
         problem = make_problem(prepared, settings, slice(0, 1), 0)
         if isinstance(problem, str):
             raise InputError(f"outputs.convergence: integration {index} cannot be calibrated: {problem}")

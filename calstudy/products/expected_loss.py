@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +116,7 @@ def solved_inputs(graph: Graph, parity: str = "even") -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class _Solution:
+class Solution:
     """The problem of one solve and its solution: gains (Nants, Nfreqs), model (Ntimes Nbls, Nfreqs), pairs (Nbls, 2).
 
     `used` are the samples that are not flagged, like the model, and `vectors` those of the baselines, m, (Nbls, 3). A
@@ -135,9 +136,11 @@ class _Solution:
         """Lengths of the baselines of each integration, m, (Ntimes Nbls,)."""
         return np.resize(np.linalg.norm(self.vectors, axis=1), len(self.model))
 
-    def axes(self, modes: DelayModes) -> dict[str, Any]:
-        """Return the inputs of `modes_of` beside amplitudes: delays, lengths and the centre of the band."""
-        return {"delay": modes.delay, "lengths": self.lengths, "centre": self.frequency.mean()}
+    def left_of(self, signal: np.ndarray) -> np.ndarray:
+        """Return what is left of a signal, (Ntimes Nbls, Nfreqs), by the linear response of the fit."""
+        from calstudy.calibrate.expected_loss import linear_response as response_to
+
+        return response_to(self.problem, self.gains, self.model, signal) * self.used
 
 
 class Solved(Calibrated):
@@ -148,7 +151,7 @@ class Solved(Calibrated):
     power: PowerSettings
     integration: int
 
-    def solution(self) -> _Solution | None:
+    def solution(self) -> Solution | None:
         """Return the solution, or None if an antenna or a channel has no gains or the integrations were not solved."""
         from calstudy.calibrate.preparation import problem_at
         from calstudy.products.selection import read_gains
@@ -169,7 +172,7 @@ class Solved(Calibrated):
         if isinstance(problem, str) or fitted.flags[self.integration].any():
             return None
         model = read_visibilities(self.calibration / MODEL, times)
-        return _Solution(
+        return Solution(
             problem,
             gains,
             to_cube(model)[..., 0].reshape(problem.visibilities.shape),
@@ -178,11 +181,6 @@ class Solved(Calibrated):
             prepared.data.vectors,
             np.asarray(data.freq_array, float),
         )
-
-    @property
-    def times(self) -> np.ndarray:
-        """Julian date of the integration, (1,)."""
-        return integration_times(self.data / DATA)[[self.integration]]
 
 
 class ExpectedLoss(Solved, stage="expected-loss", version=5):
@@ -214,7 +212,27 @@ class ExpectedLoss(Solved, stage="expected-loss", version=5):
         return cost_of_responses(self, self.probes, 1.5e9)
 
 
-class Response(Solved, stage="response", version=2):
+class Responses(Solved):
+    """What one calibrated integration leaves of signals."""
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the amplitudes of the signals and of what is left of them; none if there are no gains."""
+        from calstudy.calibrate.expected_loss import DelayModes
+
+        solution, arrays = self.solution(), {}
+        if solution is not None:
+            modes = DelayModes(solution.frequency, self.power.taper)
+            arrays = {"delay": modes.delay, "lengths": solution.lengths, "centre": solution.frequency.mean()}
+            arrays |= self.amplitudes(solution, modes)
+        np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
+        return {}
+
+    @abstractmethod
+    def amplitudes(self, solution: Solution, modes: DelayModes) -> dict[str, np.ndarray]:
+        """Return the amplitudes at the delays, by name."""
+
+
+class Response(Responses, stage="response", version=2):
     """The linear response of one calibrated integration to a signal.
 
     Since version 2 baselines without weight have one, and flagged samples no signal.
@@ -222,24 +240,12 @@ class Response(Solved, stage="response", version=2):
 
     signal: Input
 
-    def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the amplitudes of the signal and of what is left of it; none if there are no gains."""
-        from calstudy.calibrate.expected_loss import DelayModes
-        from calstudy.calibrate.expected_loss import linear_response as response_to
-
-        solution, arrays = self.solution(), {}
-        if solution is not None:
-            eor = read_visibilities(self.signal / DATA, self.times)
-            signal = solution.used * to_cube(eor)[0, rows_of(eor, solution.pairs), :, 0]
-            left = response_to(solution.problem, solution.gains, solution.model, signal) * solution.used
-            modes = DelayModes(solution.frequency, self.power.taper)
-            arrays = {
-                **solution.axes(modes),
-                "signal": modes.amplitudes(signal),
-                "left": modes.amplitudes(left),
-            }
-        np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
-        return {}
+    def amplitudes(self, solution: Solution, modes: DelayModes) -> dict[str, np.ndarray]:
+        """Return the amplitudes of the signal and of what is left of it."""
+        times = integration_times(self.data / DATA)[[self.integration]]
+        eor = read_visibilities(self.signal / DATA, times)
+        signal = solution.used * to_cube(eor)[0, rows_of(eor, solution.pairs), :, 0]
+        return {"signal": modes.amplitudes(signal), "left": modes.amplitudes(solution.left_of(signal))}
 
     def _cost(self) -> Cost:
         return cost_of_responses(self, 1, 2.5e9)
@@ -253,26 +259,35 @@ def cost_of_responses(task: Solved, responses: int, memory: float) -> Cost:
     return Cost(1 + 0.8 * responses * work, LIBRARIES_MEMORY + memory * work, 1e6)
 
 
-class LinearResponse(Task, stage="linear-response", version=2, cost=Cost(0.1, disk=1e4)):
-    """T and C of the linear response of one integration to the EoR, in two realizations of the noise."""
+class OfResponses(Task):
+    """What is made of the responses of one integration in two realizations of the noise."""
 
     power: PowerSettings
     even: Input
     odd: Input
 
-    def make(self, output: Path) -> Mapping[str, Any]:
-        """Write T and C in bands, crossed between the realizations as T by injection is, or null if not known."""
+    def read(self) -> tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray], BaselineModes] | None:
+        """Return the amplitudes in both realizations and their modes, or None if one has no gains."""
         even, odd = (read_arrays(folder / AMPLITUDES) for folder in (self.even, self.odd))
         if not even or not odd:
-            write_json(output / RESPONSE, {"bands": None})
-            return {}
-        where = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
-        answers = even["left"], odd["left"]
-        transfer, cross = bin_response(where, even["signal"], answers, BANDS, self.power.wedge_buffer)
-        bands = [
-            {"transfer": json_number(left), "cross_transfer": json_number(crossed)}
-            for left, crossed in zip(transfer, cross, strict=True)
-        ]
+            return None
+        return even, odd, modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
+
+
+class LinearResponse(OfResponses, stage="linear-response", version=2, cost=Cost(0.1, disk=1e4)):
+    """T and C of the linear response of one integration to the EoR."""
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write T and C in bands, crossed between the realizations as T by injection is, or null if not known."""
+        bands = None
+        if (found := self.read()) is not None:
+            even, odd, modes = found
+            answers = even["left"], odd["left"]
+            transfer, cross = bin_response(modes, even["signal"], answers, BANDS, self.power.wedge_buffer)
+            bands = [
+                {"transfer": json_number(left), "cross_transfer": json_number(crossed)}
+                for left, crossed in zip(transfer, cross, strict=True)
+            ]
         write_json(output / RESPONSE, {"bands": bands})
         return {}
 

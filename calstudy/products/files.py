@@ -29,12 +29,9 @@ TRANSFER, TRANSFER_BANDS = "transfer", "transfer-bands"
 
 
 def spectrum_file(name: str, kind: str) -> str:
-    """Return the name of the file that holds an averaged power spectrum or a transfer function.
+    """Return the name of the file with an averaged power spectrum of a variant, or with a transfer function.
 
-    Parameters
-    ----------
-    name : a variant, or one of the names in `calstudy.products.signal_loss`
-    kind : "wedge" for the cylindrical spectrum; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones
+    The kind is "wedge" for the cylindrical one; "all-modes", "outside-wedge" or "inside-wedge" for spherical ones.
     """
     return f"{name}.{kind}.h5"
 

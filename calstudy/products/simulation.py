@@ -155,7 +155,7 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
                 antennas=size.antennas,
                 beams=beams,
                 tolerance=accuracy.tolerance,
-                regular=_is_regular(instrument),
+                regular=layout_of(instrument.layout).regular and not instrument.as_built.positions.scatter,
             )
         )
         total = size.samples / size.channels.count * nodes[1] * COMPLEX128
@@ -268,11 +268,6 @@ def _node_counts(
         return in_time, channels.count
     in_frequency = chebyshev_count(frequency_bandwidth(np.array([low, high]), length), tolerance)
     return in_time, min(in_frequency, channels.count)
-
-
-def _is_regular(instrument: InstrumentSettings) -> bool:
-    """Return true if the antennas are on a flat lattice."""
-    return layout_of(instrument.layout).regular and not instrument.as_built.positions.scatter
 
 
 def _pieces(simulation: SimulationSettings, sky: Foregrounds | Eor, instrument: InstrumentSettings) -> int:

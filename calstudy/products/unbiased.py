@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,19 +18,22 @@ from calstudy.power.tables import save_spectrum
 from calstudy.power.windows import BinSignals, UnbiasedSpectrum, deconvolved, window_matrix
 from calstudy.products import corruption, signal_loss
 from calstudy.products.expected_loss import (
-    AMPLITUDES,
     NOT_OF_THE_FIT,
-    Solved,
+    OfResponses,
+    Responses,
+    Solution,
     cost_of_responses,
-    modes_of,
     solved_inputs,
     why_no_response,
 )
-from calstudy.products.files import read_arrays, read_json
+from calstudy.products.files import read_json
 from calstudy.products.graph import Graph, memoize, required
 from calstudy.products.signal_loss import SCALE
 from calstudy.products.spectra import read_recovered, spectra
 from calstudy.run.task import Input, Task
+
+if TYPE_CHECKING:
+    from calstudy.calibrate.expected_loss import DelayModes
 
 UNBIASED = "unbiased.h5"
 FURTHEST = 0.6
@@ -61,61 +64,42 @@ def unbiased(graph: Graph) -> Task:
     return Unbiased("spectrum without loss", power=power, even=even, odd=odd, spectra=spectra(graph), scale=scale)
 
 
-class BinResponse(Solved, stage="bin-response", version=2):
+class BinResponse(Responses, stage="bin-response", version=2):
     """The linear response of one calibrated integration to random signals of each bin of k.
 
     Since version 2 baselines without weight have one, where the foregrounds are the sky model.
     """
 
-    def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the amplitudes of what is left of the signals; none if there are no gains."""
-        from calstudy.calibrate.expected_loss import DelayModes
-        from calstudy.calibrate.expected_loss import linear_response as response_to
-
-        solution, arrays = self.solution(), {}
-        if solution is not None:
-            groups = redundant_groups(solution.vectors, REDUNDANT)
-            where = solution.frequency, solution.lengths, groups.index, groups.conjugated
-            signals = BinSignals(*where, window_edges(self.power), self.power.cosmology)
-            modes, rng = DelayModes(solution.frequency, self.power.taper), np.random.default_rng(SEED)
-            fit = solution.problem, solution.gains, solution.model
-            drawn = [[solution.used * signal for signal in signals.draw(rng)] for _ in range(DRAWS)]
-            left = [
-                [modes.amplitudes(solution.used * response_to(*fit, signal)) for signal in parts] for parts in drawn
-            ]
-            powers = [np.abs(modes.amplitudes(signal)) ** 2 for parts in drawn for signal in parts]
-            arrays = {
-                **solution.axes(modes),
-                "left": np.array(left, np.complex64),
-                "put_in": np.sum(powers, axis=0) / DRAWS,
-            }
-        np.savez(output / AMPLITUDES, allow_pickle=False, **arrays)
-        return {}
+    def amplitudes(self, solution: Solution, modes: DelayModes) -> dict[str, np.ndarray]:
+        """Return the amplitudes of what is left of the signals, and the power of these."""
+        groups, rng = redundant_groups(solution.vectors, REDUNDANT), np.random.default_rng(SEED)
+        where = solution.frequency, solution.lengths, groups.index, groups.conjugated
+        signals = BinSignals(*where, window_edges(self.power), self.power.cosmology)
+        drawn = [[solution.used * signal for signal in signals.draw(rng)] for _ in range(DRAWS)]
+        left = [[modes.amplitudes(solution.left_of(signal)) for signal in parts] for parts in drawn]
+        powers = [np.abs(modes.amplitudes(signal)) ** 2 for parts in drawn for signal in parts]
+        return {"left": np.array(left, np.complex64), "put_in": np.sum(powers, axis=0) / DRAWS}
 
     def _cost(self) -> Cost:
         return cost_of_responses(self, DRAWS * len(window_edges(self.power)), 2.5e9)
 
 
-class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
+class Unbiased(OfResponses, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
     """The spectrum of the residual without its loss, by the window functions of one integration.
 
     They are those of a run that is so short that the loss of one integration is that of the average. Errors are those
     of the whole EoR and noise, upper bounds for what is left of them, in bins that are taken as independent.
     """
 
-    power: PowerSettings
-    even: Input
-    odd: Input
     spectra: Input
     scale: Input
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the spectrum with its window functions; raises InputError if the integration has no gains."""
         edges = window_edges(self.power)
-        even, odd = (read_arrays(folder / AMPLITUDES) for folder in (self.even, self.odd))
-        if not even or not odd:
+        if (found := self.read()) is None:
             raise InputError("unbiased: the middle integration has antennas or channels without gains")
-        modes = modes_of(even["delay"], even["lengths"], float(even["centre"]), self.power)
+        even, odd, modes = found
         both = even["left"], odd["left"]
         window = window_matrix(modes, both, even["put_in"], edges, self.power.wedge_buffer)
         residual, signal = read_recovered(self.spectra)
@@ -124,8 +108,8 @@ class Unbiased(Task, stage="unbiased", version=1, cost=Cost(1, disk=1e5)):
         measured, error = (1 if known is None else known**2) * residual.power.real[bins], residual.error[bins]
         power, its_error = deconvolved(window, measured, error)
         k = (edges[1:] + edges[:-1]) / 2
-        found = UnbiasedSpectrum(k, edges, window, measured, error, power, its_error, signal.power.real[bins])
-        save_spectrum(output / UNBIASED, found)
+        spectrum = UnbiasedSpectrum(k, edges, window, measured, error, power, its_error, signal.power.real[bins])
+        save_spectrum(output / UNBIASED, spectrum)
         return {}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from calstudy.base.table import number, two_digits
 from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
-from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.standing import SIGMAS, marked, why_not_measured
 from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
@@ -79,8 +77,11 @@ def read_headline(run: RunFolder) -> list[Number]:
     """Return T, bias and flux scale of a finished run, or the fit to measured data, and counts of its claims."""
     signal = read_signal(run)
     numbers = measured_numbers(run) if signal is None else signal.numbers
-    verdicts = _verdicts(run.claims)
-    return [*numbers, *([] if verdicts is None else [verdicts])]
+    outcomes = list(outcomes_of_sentences(run.claims).values())
+    if evaluated := counts(outcome for outcome in outcomes if outcome != "not evaluated"):
+        meaning = f"sentences of the papers; {len(outcomes)} in all, the others were not evaluated"
+        numbers.append(Number("claims", evaluated, meaning))
+    return numbers
 
 
 def read_signal(run: RunFolder) -> Signal | None:
@@ -119,10 +120,3 @@ def measured_numbers(run: RunFolder) -> list[Number]:
             left = f"part of an injected EoR's power that is left, outside the wedge, k of {low:g} to {high:g} h/Mpc"
             numbers.append(Number(f"T at k of {low:g} to {high:g} h/Mpc", text, left))
     return numbers
-
-
-def _verdicts(claims: Sequence[Verdict]) -> Number | None:
-    outcomes = list(outcomes_of_sentences(claims).values())
-    evaluated = counts(outcome for outcome in outcomes if outcome != "not evaluated")
-    meaning = f"sentences of the papers; {len(outcomes)} in all, the others were not evaluated"
-    return Number("claims", evaluated, meaning) if evaluated else None

@@ -89,12 +89,6 @@ def test_gains_are_drawn_as_the_caption_says():
     np.testing.assert_allclose(xy(delays.get_lines()[-1]), (expected.delay * 1e9, np.abs(expected.transform)))
 
 
-def test_gains_of_other_shapes_are_refused():
-    expected = r"shapes \(3, 384\), \(2, 384\) and \(2, 384\), expected two antennas and 384 channels"
-    with pytest.raises(ValueError, match=expected):
-        compare_gains((0, 1), FREQUENCY, np.ones((3, 384)), np.ones((2, 384)), np.ones((2, 384)))
-
-
 def test_visibilities_residual_noise_and_horizon_are_drawn(visibility_comparison):
     figure = draw_comparison(visibility_comparison, ("data", "model"))
     values, residuals, delays = sorted(figure.axes, key=lambda axes: axes.get_xlabel() == "delay (ns)")
@@ -130,8 +124,6 @@ def test_every_column_of_baselines_ends_in_a_delay_axis(baseline_spectra):
         axes = [axes for axes in draw_baselines(baseline_spectra[:count]).axes if axes.get_visible()]
         assert len(axes) == count
         assert sum(item.get_xlabel() == "delay (ns)" for item in axes) == min(count, 2)
-    with pytest.raises(ValueError, match="at least one baseline"):
-        draw_baselines([])
 
 
 def test_reflections_peak_at_their_delay_and_again_at_twice_it():
@@ -184,5 +176,3 @@ def test_run_times_that_cannot_be_fitted_are_refused():
     for size, seconds in (([8, 16], [[1.0], [2.0]]), ([8, 16, 32], [[1.0], [2.0], [0.0]]), ([8, 16, 32], [[1.0]] * 2)):
         with pytest.raises(ValueError, match="positive values at three sizes"):
             summarize_runtime("x", size, seconds)
-    with pytest.raises(ValueError, match="1 to 8 series, not 0"):
-        draw_runtime([], "number of antennas")

@@ -58,10 +58,3 @@ def test_large_arrays_have_no_numbers():
     rng = np.random.default_rng(22)
     axes = draw_layouts([LayoutPanel("128", np.arange(128), 300 * rng.normal(size=(128, 3)))]).axes[0]
     assert len(axes.texts) == 0
-
-
-def test_bad_input_is_refused(panels):
-    with pytest.raises(ValueError, match="1 or 2 panels, not 3"):
-        draw_layouts(panels + panels[:1])
-    with pytest.raises(ValueError, match="'x': 3 antenna numbers for 2 positions"):
-        draw_layouts([LayoutPanel("x", np.arange(3), np.zeros((2, 3)))])

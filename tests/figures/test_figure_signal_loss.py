@@ -141,11 +141,3 @@ def test_a_sweep_has_a_panel_per_field_with_its_values_below():
     assert "Mpc" in labels[1]
     assert labels[2] == "free of the flux scale $s$"
     assert [text.get_text() for text in one.texts] == ["$s$ = 1.020"] * 2
-
-
-def test_sweeps_without_panels_or_with_different_bands_are_refused():
-    with pytest.raises(ValueError, match="no panel"):
-        draw_sweep([])
-    other = SweepPanel("a", "", ["x"], [function([0.5], [0.1, 0.4])])
-    with pytest.raises(ValueError, match="different bands"):
-        draw_sweep([panel(["y"], [[0.1, 0.2]]), other])
