@@ -143,8 +143,8 @@ class SignalLossFigure(StudyFigure):
 
     caption = (
         "What the calibration leaves of the EoR: T = P^D / P^S of the part D of the residual that the EoR makes, per k "
+        "and per baseline length and delay."
     )
-    "and per baseline length and delay."
     variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True
     needs_calibration = True
