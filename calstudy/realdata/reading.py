@@ -18,7 +18,7 @@ from astropy import units
 from pyuvdata import UVData, utils
 
 from calstudy.base.constants import SECONDS_PER_DAY
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gain_files import CASACORE
 from calstudy.base.visibilities import keep_compiled_pyuvdata, polarization_names
@@ -84,10 +84,8 @@ def read_metadata(paths: Sequence[Path]) -> UVData:
 def _require_readable(paths: Sequence[Path]) -> None:
     """Raise InputError unless all paths exist, can be read with what is installed, and hold their own data."""
     for path in paths:
-        try:
+        with errors_of_files(f"{path}: cannot be read"):
             found = path.exists()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
         if not found:
             raise InputError(f"{path}: no such file or folder")
         # All CASA tables have this file.

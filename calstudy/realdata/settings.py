@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import Section, choice, fault
 from calstudy.base.units import Decibel, FluxDensity
@@ -50,10 +50,8 @@ def find_data(text: str, folder: Path) -> Path:
             path = folder / Path(text).expanduser()
         except RuntimeError:
             raise InputError(f"{text!r}: there is no such home folder") from None
-    try:
+    with errors_of_files(f"{text!r}: cannot be read"):
         found = path.exists()
-    except OSError as error:
-        raise InputError(f"{text!r}: cannot be read ({error.strerror})") from None
     if not found:
         raise InputError(f"{text!r}: no such file or folder (looked for {path.resolve()})")
     return path.resolve()

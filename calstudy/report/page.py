@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.files import replacing, rounded
 from calstudy.base.paths import leaves
 from calstudy.base.table import Table
@@ -372,11 +372,8 @@ def write_report(folder: Path) -> Path:
 
 def write_page(page: str, path: Path) -> Path:
     """Write a page, completely or not at all, and return its path; raises InputError if it cannot be written."""
-    try:
-        with replacing(path) as stream:
-            stream.write(page.encode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    with errors_of_files(f"{path}: cannot be written"), replacing(path) as stream:
+        stream.write(page.encode())
     return path
 
 
