@@ -148,7 +148,7 @@ def test_its_fields_are_listed(folder):
     write(folder)
     page = plugin_reference(folder / "seeds.py")
     assert "# Files with `study: seeds.py:Seeds`" in page
-    assert "| `seeds` | list | required | Seeds of the EoR. |" in page
+    assert "| `seeds` | list of whole numbers | required | Seeds of the EoR. |" in page
 
 
 @pytest.mark.parametrize(
