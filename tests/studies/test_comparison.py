@@ -97,6 +97,24 @@ def test_held_out_data_are_fitted_to_the_noise_unless_the_sky_is_wrong(summaries
     assert wrong["sky-based"]["held_out_chi_squared"] > 100
 
 
+@pytest.mark.parametrize(
+    ("changes", "notes"),
+    [
+        (
+            {},
+            ["calibration.weights of base.yaml is not that of the calibrators; for all of them, set it in overrides"],
+        ),
+        ({"overrides": {"calibration.weights": "flags"}, "calibrators": {"A": "sky-based", "B": "calamity"}}, []),
+    ],
+)
+def test_a_plan_notes_weights_that_no_calibrator_has(tmp_path, changes, notes):
+    path = comparison_file(tmp_path, **changes)
+    base = yaml.safe_load((tmp_path / "base.yaml").read_text())
+    base["calibration"] = {"calibrator": "calamity", "solver": "gauss-newton", "weights": "flags"}
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(base))
+    assert [note for note in load_study(path).notes if "base.yaml" in note] == notes
+
+
 def test_without_calibration_gain_errors_times_foregrounds_are_the_bias(summaries):
     """Gains of 1 + 0.1 (n + i n') times a perfect sky model: the error of g g* has the power 4 sigma^2 of F, white."""
     found = summaries["ideal"]["none"]

@@ -51,6 +51,8 @@ from calstudy.studies.study import KINDS, kind_of
 LONGEST_LABEL = 40
 NOT_SHARED = ("calibration", "sweep", "realizations", "scales")
 """Keys of the experiment that the cases do not take from it, but for `calibration.assumed`."""
+OF_CALIBRATORS = ("assumed", CALIBRATORS.tag, "solver", "chunks")
+"""Fields of the calibration of that experiment which belong to worlds, to a calibrator, or change no result."""
 CALIBRATOR = f"calibration.{CALIBRATORS.tag}"
 OWN = ("name", "description", "calibrators", "worlds", "figures", "salt")
 """Keys of a comparison that --set changes in the file itself; all others are fields of the experiment."""
@@ -289,7 +291,20 @@ class Comparison(Family):
             f"{calibrator} cannot work in {'any world' if len(found) == count else ', '.join(found)}: {reason}"
             for (calibrator, reason), found in worlds.items()
         )
-        return (*super().notes, *refused)
+        return (*super().notes, *self._left_out, *refused)
+
+    @cached_property
+    def _left_out(self) -> tuple[str, ...]:
+        """A note for settings of the calibration in the file of the experiment that no case has."""
+        source = self.file.experiment
+        given = read_mapping(source).get("calibration") if isinstance(source, Path) else None
+        lost = [
+            field
+            for field in (given if isinstance(given, Mapping) else ())
+            if field not in OF_CALIBRATORS and f"calibration.{field}" not in self.resolved["overrides"]
+        ]
+        sentence = f"calibration.{', '.join(lost)} of {getattr(source, 'name', '')} is not that of the calibrators"
+        return (f"{sentence}; for all of them, set it in overrides",) if lost else ()
 
     @property
     def _labels(self) -> dict[str, Any]:
