@@ -135,7 +135,7 @@ def _digits(value: float) -> str:
         return "–"
     if abs(value) >= 1e4:
         return f"{value:.0e}".replace("e+0", "e")
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}"
+    return f"{value:.0f}" if abs(value) >= 99.5 else f"{value:.2g}"
 
 
 class ComparisonMatrix(CasesFigure):

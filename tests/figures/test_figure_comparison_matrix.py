@@ -33,6 +33,7 @@ def cell(found, worlds=1):
         (0.3, 0.121, "bias 0.3"),
         (-3.0, 0.5, "bias -3"),
         (7.0, np.nan, "bias 7"),
+        (99.7, 9.0, "bias 100"),
         (np.nan, np.nan, "bias –"),
     ],
 )
