@@ -18,7 +18,7 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.products.signal_loss import SweepSummary, Transfer
-from calstudy.report.page import read_contents, recorded_warnings, write_report
+from calstudy.report.page import read_contents, recorded_warnings, render, write_report
 from calstudy.results.reader import RunFolder
 
 
@@ -73,6 +73,13 @@ def test_the_page_needs_nothing_but_itself(folder):
     # Links lead within the page, or to files of the run folder.
     links = [value for _, name, value in page.attributes if name == "href"]
     assert all(link.startswith("#") or (folder / link).is_file() for link in links)
+
+
+def test_tables_of_one_subject_have_one_link_in_the_menu(folder):
+    tables = [Table(("k",), [("1",)], title) for title in ("Scores: ideal", "Scores: no sky", "Stages")]
+    page = Page(render(dataclasses.replace(read_contents(RunFolder(folder)), tables=tables)))
+    links = [value for _, name, value in page.attributes if name == "href" and value.startswith("#table")]
+    assert links == ["#table-1", "#table-3"]
 
 
 def test_figures_are_in_the_page_as_they_are_in_the_folder(folder):
