@@ -36,11 +36,11 @@ def load_tensorflow() -> None:
         return
     with _without_keras(), errors_written_to(Path(os.devnull)):
         importlib.import_module("tensorflow")
-    logging.getLogger("tensorflow").addFilter(_is_no_count_of_tracings)
+    logging.getLogger("tensorflow").addFilter(_is_not_about_tracing)
 
 
-def _is_no_count_of_tracings(record: logging.LogRecord) -> bool:
-    """Leave out a warning: every structure of a fit is traced once, and TensorFlow counts these together."""
+def _is_not_about_tracing(record: logging.LogRecord) -> bool:
+    """Return False for a warning that does not apply: each fit structure is traced once, and TensorFlow counts all."""
     return "triggered tf.function retracing" not in record.getMessage()
 
 

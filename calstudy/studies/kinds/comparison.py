@@ -298,13 +298,12 @@ class Comparison(Family):
         """A note for settings of the calibration in the file of the experiment that no case has."""
         source = self.file.experiment
         given = read_mapping(source).get("calibration") if isinstance(source, Path) else None
-        lost = [
-            field
-            for field in (given if isinstance(given, Mapping) else ())
-            if field not in OF_CALIBRATORS and f"calibration.{field}" not in self.resolved["overrides"]
-        ]
-        sentence = f"calibration.{', '.join(lost)} of {getattr(source, 'name', '')} is not that of the calibrators"
-        return (f"{sentence}; for all of them, set it in overrides",) if lost else ()
+        if not isinstance(source, Path) or not isinstance(given, Mapping):
+            return ()
+        changed = self.resolved["overrides"]
+        lost = [field for field in given if field not in OF_CALIBRATORS and f"calibration.{field}" not in changed]
+        named = f"calibration.{', '.join(lost)} of {source.name}"
+        return (f"{named} is not that of the calibrators; for all of them, set it in overrides",) if lost else ()
 
     @property
     def _labels(self) -> dict[str, Any]:
