@@ -22,7 +22,6 @@ from calstudy.calibrate.solvers.interface import Solution, WarmStart, solve_warm
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Layout
-from calstudy.run.task import Job
 from calstudy.studies.load import load_study
 
 ROOT = Path(__file__).parents[1]
@@ -63,12 +62,12 @@ def measure_chunk(benchmark: BenchmarkFixture, label: str, folder: Path) -> None
     task = next(task for task in study.tasks if task.label == label)
     numbers = count()
 
-    def new_job() -> tuple[tuple[Job], dict[str, Any]]:
+    def new_folder() -> tuple[tuple[Path], dict[str, Any]]:
         output = folder / str(next(numbers))
         output.mkdir()
-        return (Job(settings=task.settings, inputs={}, output=output),), {}
+        return (output,), {}
 
-    benchmark.pedantic(task.stage.make, setup=new_job, rounds=2)
+    benchmark.pedantic(task.make, setup=new_folder, rounds=2)
 
 
 def bench_foreground_part(benchmark: BenchmarkFixture, tmp_path: Path) -> None:

@@ -38,12 +38,14 @@ FAINT = (1, 1, 1, 0.45)
 LARGE_ERROR = 0.1
 """Largest standard deviation of T that is written with two decimals alone; a larger one would make it look exact."""
 ROOM_FOR_ERROR = 8
-"""Largest number of worlds side by side in whose cells T fits with its error; with more, it has one decimal."""
+"""Largest number of columns in whose cells T fits with its error; with more, it has one decimal."""
+MAX_COLUMNS = 11
+"""Largest number of worlds side by side; more are one below the other, and calibrators are the columns."""
 
 
 @style.journal_style()
 def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
-    """Draw a matrix for each band of k: worlds from left to right, calibrators from top to bottom.
+    """Draw a matrix for each band of k: worlds from left to right, or from top to bottom where they are many.
 
     The colour is the bias. For a bias within two standard deviations of zero, the 95 % upper limit is written and
     coloured, and the cell is hatched; a T that is not measured is not written. `cases` are by world and calibrator; a
@@ -52,65 +54,61 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
 
-    worlds = list(cases)
+    columns, rows = list(cases), list(calibrators)
+    cells = [[found.get(name) for found in cases.values()] for name in rows]
+    if len(columns) > MAX_COLUMNS and len(rows) < len(columns):
+        columns, rows, cells = rows, columns, [list(row) for row in zip(*cells, strict=True)]
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     n_bands = edges.size - 1
-    height = n_bands * (HEADING_HEIGHT + ROW_HEIGHT * len(calibrators)) + 0.4
-    figure = style.new_figure(style.TWO_COLUMNS if len(worlds) > 2 else style.ONE_COLUMN + 1, height)
+    height = n_bands * (HEADING_HEIGHT + ROW_HEIGHT * len(rows)) + 0.4
+    figure = style.new_figure(style.TWO_COLUMNS if len(columns) > 2 else style.ONE_COLUMN + 1, height)
     panels = figure.subplots(n_bands, 1, squeeze=False, sharex=True)[:, 0]
     shades = ScalarMappable(LogNorm(*LIMITS), COLOURS)
     for band, axes in enumerate(panels):
-        _draw_band(axes, cases, calibrators, band, shades)
+        _draw_band(axes, cells, band, shades)
+        axes.set_yticks(range(len(rows)), rows)
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
-    _name_worlds(panels[-1], worlds)
+    _name_columns(panels[-1], columns)
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$; hatched: upper limit")
     return figure
 
 
-def _name_worlds(axes: Axes, worlds: Sequence[str]) -> None:
+def _name_columns(axes: Axes, labels: Sequence[str]) -> None:
     """Write the labels of the columns, in several lines or, if words are wider than a column, slanted."""
-    width = LABELS_WIDTH // len(worlds)
-    if max(len(word) for world in worlds for word in world.split()) <= width:
-        axes.set_xticks(range(len(worlds)), [textwrap.fill(world, width) for world in worlds])
+    width = LABELS_WIDTH // len(labels)
+    if max(len(word) for label in labels for word in label.split()) <= width:
+        axes.set_xticks(range(len(labels)), [textwrap.fill(label, width) for label in labels])
     else:
-        axes.set_xticks(range(len(worlds)), worlds, rotation=30, ha="right", rotation_mode="anchor")
+        axes.set_xticks(range(len(labels)), labels, rotation=30, ha="right", rotation_mode="anchor")
 
 
-def _draw_band(
-    axes: Axes,
-    cases: Mapping[str, Mapping[str, Case]],
-    calibrators: Sequence[str],
-    band: int,
-    shades: ScalarMappable,
-) -> None:
+def _draw_band(axes: Axes, cells: Sequence[Sequence[Case | None]], band: int, shades: ScalarMappable) -> None:
     from matplotlib.patches import Rectangle
 
-    colours = np.full((len(calibrators), len(cases), 4), 1.0)
-    for column, found in enumerate(cases.values()):
-        for row, name in enumerate(calibrators):
-            if name not in found:
-                axes.text(column, row, "no scores", ha="center", va="center", size=style.SMALL_SIZE, color=style.GREY)
-                continue
-            case = found[name]
-            bands = case.bands
-            shown, bias = _bias(bands.bias[band], bands.bias_error[band])
-            if np.isfinite(shown):
-                colours[row, column] = shades.to_rgba(np.asarray(shown))
-            if is_limit(bands.bias[band], bands.bias_error[band]):
-                axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, hatch="////", ec=FAINT, lw=0))
-            axes.text(
-                column,
-                row,
-                f"{bias}\n{_transfer(bands.transfer[band], bands.transfer_error[band], len(cases))}",
-                ha="center",
-                va="center",
-                fontsize=style.SMALL_SIZE,
-                color="white" if shown > DARK else style.BLACK,
-                linespacing=1.1,
-            )
+    n_columns = len(cells[0])
+    colours = np.full((len(cells), n_columns, 4), 1.0)
+    for (row, column), case in np.ndenumerate(np.array(cells, dtype=object)):
+        if case is None:
+            axes.text(column, row, "no scores", ha="center", va="center", size=style.SMALL_SIZE, color=style.GREY)
+            continue
+        bands = case.bands
+        shown, bias = _bias(bands.bias[band], bands.bias_error[band])
+        if np.isfinite(shown):
+            colours[row, column] = shades.to_rgba(np.asarray(shown))
+        if is_limit(bands.bias[band], bands.bias_error[band]):
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, hatch="////", ec=FAINT, lw=0))
+        axes.text(
+            column,
+            row,
+            f"{bias}\n{_transfer(bands.transfer[band], bands.transfer_error[band], n_columns)}",
+            ha="center",
+            va="center",
+            fontsize=style.SMALL_SIZE,
+            color="white" if shown > DARK else style.BLACK,
+            linespacing=1.1,
+        )
     axes.imshow(colours, aspect="auto")
-    axes.set_yticks(range(len(calibrators)), calibrators)
     axes.tick_params(length=0)
 
 
@@ -122,12 +120,12 @@ def _bias(bias: float, error: float) -> tuple[float, str]:
     return abs(bias), f"bias {_digits(bias)}"
 
 
-def _transfer(value: float, error: float, n_worlds: int) -> str:
+def _transfer(value: float, error: float, n_columns: int) -> str:
     if not is_measured(value, error):
         return "no $T$"
     if not (np.isfinite(error) and error > LARGE_ERROR):
         return f"$T$ = {value:.2f}"
-    return f"$T$ = {number(value, error) if n_worlds <= ROOM_FOR_ERROR else f'{value:.1f}'}"
+    return f"$T$ = {number(value, error) if n_columns <= ROOM_FOR_ERROR else f'{value:.1f}'}"
 
 
 def _digits(value: float) -> str:
@@ -141,7 +139,7 @@ def _digits(value: float) -> str:
 class ComparisonMatrix(CasesFigure):
     """A matrix of calibrators and worlds for each band of k: colour and number are the bias, T is written below it."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     kind: str = "comparison-matrix"
     caption = (

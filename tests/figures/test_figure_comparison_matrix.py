@@ -71,15 +71,34 @@ def test_t_has_no_more_decimals_than_its_error_allows(transfer, error, worlds, t
     assert text == told
 
 
-@pytest.mark.parametrize("worlds", [1, 3, 6, 8, 10])
+@pytest.mark.parametrize("worlds", [1, 3, 6, 8, 11, 18])
 def test_texts_stay_in_their_cells(worlds):
     widest = case(bias=0.0984, bias_error=0.0984, transfer=-0.374, transfer_error=0.26)
     figure = draw({f"w{number}": widest for number in range(worlds)})
     with style.journal_style():
         figure.draw_without_rendering()
         axes = figure.axes[0]
-        width = axes.get_window_extent().width / worlds
+        width = axes.get_window_extent().width / axes.images[0].get_array().shape[1]
         assert all(text.get_window_extent().width < width for text in axes.texts)
+
+
+@pytest.mark.parametrize("worlds", [3, 18])
+def test_each_cell_is_of_its_world_and_calibrator(worlds):
+    cases = {
+        f"w{world}": {name: case(bias=world + place / 10, bias_error=1e-3) for place, name in enumerate(("a", "b"), 2)}
+        for world in range(1, worlds + 1)
+    }
+    del cases["w2"]["b"]
+    figure = draw_matrix(cases, ["a", "b"])
+    axes = figure.axes[0]
+    columns = [label.get_text() for label in figure.axes[2].get_xticklabels()]
+    rows = [label.get_text() for label in axes.get_yticklabels()]
+    assert "w1" in (columns if worlds == 3 else rows)
+    for text in axes.texts:
+        column, row = (int(place) for place in text.get_position())
+        world, name = sorted((columns[column], rows[row]), key=lambda label: label not in cases)
+        found = cases[world].get(name)
+        assert text.get_text().startswith("no scores" if found is None else f"bias {found.bands.bias[0]:.2g}")
 
 
 def test_the_caption_says_what_the_sign_means():
