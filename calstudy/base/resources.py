@@ -58,7 +58,7 @@ ALLOCATION = {
     )
 }
 """Environment of a process whose large arrays take the memory of freed ones. By default glibc asks the system for the
-memory of each array above some MB, and to hand it out takes 0.1 s per GB, on virtual machines up to 2.5 s: more than the
+memory of each array above some MB. To hand it out takes 0.1 s per GB, on virtual machines up to 2.5 s: more than the
 arithmetic of stages that go through all visibilities. `release_memory` gives back what is free."""
 
 

@@ -56,38 +56,42 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
 
     columns, rows = list(cases), list(calibrators)
     cells = [[found.get(name) for found in cases.values()] for name in rows]
-    if len(columns) > MAX_COLUMNS and len(rows) < len(columns):
+    if turned := len(rows) < len(columns) and len(columns) > MAX_COLUMNS:
         columns, rows, cells = rows, columns, [list(row) for row in zip(*cells, strict=True)]
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     n_bands = edges.size - 1
-    height = n_bands * (HEADING_HEIGHT + ROW_HEIGHT * len(rows)) + 0.4
-    figure = style.new_figure(style.TWO_COLUMNS if len(columns) > 2 else style.ONE_COLUMN + 1, height)
-    panels = figure.subplots(n_bands, 1, squeeze=False, sharex=True)[:, 0]
+    # Bands are side by side where worlds are the rows, and few calibrators the columns.
+    across = n_bands if turned and n_bands * len(columns) <= MAX_COLUMNS else 1
+    height = n_bands // across * (HEADING_HEIGHT + ROW_HEIGHT * len(rows)) + 0.4
+    width = style.TWO_COLUMNS if across * len(columns) > 2 else style.ONE_COLUMN + 1
+    figure = style.new_figure(width, height)
+    panels = figure.subplots(n_bands // across, across, squeeze=False, sharex=True, sharey=True)
     shades = ScalarMappable(LogNorm(*LIMITS), COLOURS)
-    for band, axes in enumerate(panels):
-        _draw_band(axes, cells, band, shades)
+    for band, axes in enumerate(panels.flat):
+        _draw_band(axes, cells, band, shades, across * len(columns))
         axes.set_yticks(range(len(rows)), rows)
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
-    _name_columns(panels[-1], columns)
+    for axes in panels[-1]:
+        _name_columns(axes, columns, LABELS_WIDTH // (across * len(columns)))
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$; hatched: upper limit")
     return figure
 
 
-def _name_columns(axes: Axes, labels: Sequence[str]) -> None:
-    """Write the labels of the columns, in several lines or, if words are wider than a column, slanted."""
-    width = LABELS_WIDTH // len(labels)
+def _name_columns(axes: Axes, labels: Sequence[str], width: int) -> None:
+    """Write the labels of the columns, in lines of so many characters or, if words are longer, slanted."""
     if max(len(word) for label in labels for word in label.split()) <= width:
         axes.set_xticks(range(len(labels)), [textwrap.fill(label, width) for label in labels])
     else:
         axes.set_xticks(range(len(labels)), labels, rotation=30, ha="right", rotation_mode="anchor")
 
 
-def _draw_band(axes: Axes, cells: Sequence[Sequence[Case | None]], band: int, shades: ScalarMappable) -> None:
+def _draw_band(
+    axes: Axes, cells: Sequence[Sequence[Case | None]], band: int, shades: ScalarMappable, n_columns: int
+) -> None:
     from matplotlib.patches import Rectangle
 
-    n_columns = len(cells[0])
-    colours = np.full((len(cells), n_columns, 4), 1.0)
+    colours = np.full((len(cells), len(cells[0]), 4), 1.0)
     for (row, column), case in np.ndenumerate(np.array(cells, dtype=object)):
         if case is None:
             axes.text(column, row, "no scores", ha="center", va="center", size=style.SMALL_SIZE, color=style.GREY)
