@@ -6,11 +6,36 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Concatenate, ParamSpec, TypeVar
 from uuid import uuid4
+
+P = ParamSpec("P")
+R = TypeVar("R")
+FileReader = Callable[Concatenate[Path, P], R]
+
+
+def kept_while_unchanged(size: int) -> Callable[[FileReader[P, R]], FileReader[P, R]]:
+    """Keep the last results of a function of a file, its first argument, while the file does not change."""
+
+    def decorate(function: FileReader[P, R]) -> FileReader[P, R]:
+        @lru_cache(size)
+        def kept(modified: int, n_bytes: int, path: Path, *args: P.args, **options: P.kwargs) -> R:
+            del modified, n_bytes
+            return function(path, *args, **options)
+
+        @wraps(function)
+        def read(path: Path, *args: P.args, **options: P.kwargs) -> R:
+            state = path.stat()
+            # The type of lru_cache does not know that all arguments can be hashed.
+            return kept(state.st_mtime_ns, state.st_size, path, *args, **options)  # type: ignore[arg-type]
+
+        return read
+
+    return decorate
 
 
 def sha256(path: Path) -> str:

@@ -12,7 +12,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import lru_cache
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
@@ -21,7 +20,7 @@ from types import ModuleType
 from typing import Any
 
 from calstudy.base.errors import InputError
-from calstudy.base.files import sha256
+from calstudy.base.files import kept_while_unchanged, sha256
 
 FILE_MODULE = "calstudy_plugin_"
 """What the names of modules that were read from a file start with."""
@@ -47,16 +46,8 @@ def parse(code: str) -> ast.Module:
                 gc.enable()
 
 
-def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hexadecimal, cached while the file does not change."""
-    status = path.stat()
-    return _digest_of(str(path), status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=256)
-def _digest_of(path: str, modified: int, size: int) -> str:
-    del modified, size
-    return sha256(Path(path))
+digest_file = kept_while_unchanged(256)(sha256)
+"""The SHA-256 of a file's content, in hexadecimal, kept while the file does not change."""
 
 
 _REFUSED: ContextVar[str] = ContextVar("refused", default="")

@@ -96,9 +96,9 @@ class Sections(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands by section, and those of no section last."""
         commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        width = formatter.width - 6 - max(map(len, commands))
+        # A whole sentence, in as many lines as it has, not cut off at the end of the first.
         texts = {
-            name: found.get_short_help_str(width) for name, found in commands.items() if found and not found.hidden
+            name: found.get_short_help_str(limit=1000) for name, found in commands.items() if found and not found.hidden
         }
         listed = {name for names in SECTIONS.values() for name in names}
         others = tuple(name for name in texts if name not in listed)

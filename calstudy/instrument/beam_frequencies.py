@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from functools import lru_cache
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import kept_while_unchanged
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.package_files import BEAM
 
@@ -62,12 +62,11 @@ def mwa_frequencies(path: Path | None) -> np.ndarray:
     path = BEAM.find() if path is None else path
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
-    return _mwa_frequencies(path, path.stat().st_mtime_ns)
+    return _mwa_frequencies(path)
 
 
-@lru_cache(maxsize=4)
-def _mwa_frequencies(path: Path, modified: int) -> np.ndarray:
-    del modified
+@kept_while_unchanged(4)
+def _mwa_frequencies(path: Path) -> np.ndarray:
     require_self_contained(path)
     try:
         with h5py.File(path) as file:

@@ -7,7 +7,6 @@ directions are interpolated between pixels (`fixed_components`), by bicubic spli
 from __future__ import annotations
 
 import warnings
-from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from pyuvdata import UVBeam
 from scipy.interpolate import make_interp_spline
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import kept_while_unchanged
 
 POLARIZATIONS = {"x": -5, "y": -6}
 # HEALPix maps finer than this are put on a grid finer than one point per degree.
@@ -38,12 +38,11 @@ def read_beamfits(path: Path) -> UVBeam:
     """
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
-    return _read(path, path.stat().st_mtime_ns)
+    return _read(path)
 
 
-@lru_cache(maxsize=2)
-def _read(path: Path, modified: int) -> UVBeam:
-    del modified
+@kept_while_unchanged(2)
+def _read(path: Path) -> UVBeam:
     with warnings.catch_warnings():
         # Files of earlier versions lack metadata that pyuvdata now requires; those used here are checked below.
         warnings.simplefilter("ignore")

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from astropy.cosmology import FLRW, Planck15, z_at_value
 
 from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
+from calstudy.base.files import kept_while_unchanged
 from calstudy.base.foreign_files import require_self_contained
 
 FIELDS = (
@@ -97,19 +97,37 @@ def redshifts_of(band: tuple[float, float]) -> np.ndarray:
     return HYDROGEN_LINE / np.array([max(band), min(band)]) - 1
 
 
+@kept_while_unchanged(8)
 def read_box(path: Path) -> Box:
     """Read the content of a file of 21cmFAST, without its cells; raises InputError if it has no brightness."""
-    status = path.stat()
-    return _read(path, status.st_mtime_ns, status.st_size)
+    require_self_contained(path)
+    try:
+        with h5py.File(path, "r") as file:
+            name = next((name for name in FIELDS if name in file), None)
+            if name is None:
+                raise _refused(path, "has no brightness_temp; use a coeval box or lightcone saved by 21cmFAST 3 or 4")
+            if file[name].ndim != 3 or min(file[name].shape) < 2:
+                raise _refused(path, f"{name} has shape {file[name].shape}; use a box or a rectilinear lightcone")
+            return _lightcone(path, file, name) if name.startswith("lightcones") else _coeval(path, file, name)
+    except InputError:
+        raise
+    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise _refused(path, f"cannot be read as a file of 21cmFAST 3 or 4 ({error})") from None
 
 
+@kept_while_unchanged(8)
 def box_power(path: Path, band: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return k in 1/Mpc and P(k) in mK² Mpc³ of the part of a file that counts for a band in Hz.
 
     Raises InputError if there is no power in it.
     """
-    status = path.stat()
-    return _measure(path, status.st_mtime_ns, status.st_size, band)
+    box = read_box(path)
+    with h5py.File(path, "r") as file:
+        brightness = np.asarray(file[box.field][..., box.part(band)], dtype=np.float32)
+    k, power = measure_power(brightness, box.cell, box.depth, periodic=box.distances is None)
+    if not (len(k) and np.isfinite(power).all() and (power > 0).all()):
+        raise _refused(path, f"{box.field} has no fluctuations, or not at all k; use a box that is not all ionized")
+    return k, power
 
 
 def measure_power(brightness: np.ndarray, cell: float, depth: float, periodic: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -164,37 +182,6 @@ def _average(
             sums += np.bincount(place, weight * values, n_bins)
     modes, log_k, power = total[:, total[0] > 0]
     return 10 ** (log_k / modes), power / modes
-
-
-@lru_cache(maxsize=8)
-def _measure(path: Path, modified: int, size: int, band: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the result of `box_power`, cached while the file does not change."""
-    box = _read(path, modified, size)
-    with h5py.File(path, "r") as file:
-        brightness = np.asarray(file[box.field][..., box.part(band)], dtype=np.float32)
-    k, power = measure_power(brightness, box.cell, box.depth, periodic=box.distances is None)
-    if not (len(k) and np.isfinite(power).all() and (power > 0).all()):
-        raise _refused(path, f"{box.field} has no fluctuations, or not at all k; use a box that is not all ionized")
-    return k, power
-
-
-@lru_cache(maxsize=8)
-def _read(path: Path, modified: int, size: int) -> Box:
-    """Return the result of `read_box`, cached while the file does not change."""
-    del modified, size
-    require_self_contained(path)
-    try:
-        with h5py.File(path, "r") as file:
-            name = next((name for name in FIELDS if name in file), None)
-            if name is None:
-                raise _refused(path, "has no brightness_temp; use a coeval box or lightcone saved by 21cmFAST 3 or 4")
-            if file[name].ndim != 3 or min(file[name].shape) < 2:
-                raise _refused(path, f"{name} has shape {file[name].shape}; use a box or a rectilinear lightcone")
-            return _lightcone(path, file, name) if name.startswith("lightcones") else _coeval(path, file, name)
-    except InputError:
-        raise
-    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise _refused(path, f"cannot be read as a file of 21cmFAST 3 or 4 ({error})") from None
 
 
 def _coeval(path: Path, file: h5py.File, name: str) -> Box:
