@@ -54,12 +54,15 @@ def resident_memory() -> int:
 ALLOCATION = {
     "GLIBC_TUNABLES": ":".join(
         f"glibc.malloc.{name}={value}"
-        for name, value in {"mmap_max": 0, "trim_threshold": 1 << 40, "arena_max": 1, "hugetlb": 1}.items()
+        for name, value in {"mmap_threshold": 1 << 29, "trim_threshold": 1 << 40, "arena_max": 1, "hugetlb": 1}.items()
     )
 }
-"""Environment of a process whose large arrays take the memory of freed ones. By default glibc asks the system for the
-memory of each array above some MB. To hand it out takes 0.1 s per GB, on virtual machines up to 2.5 s: more than the
-arithmetic of stages that go through all visibilities. `release_memory` gives back what is free."""
+"""Environment of a process whose arrays of up to half a GB take the memory of freed ones, by glibc 2.35 and later.
+
+By default glibc asks the system for the memory of each array above some MB. To hand it out takes 0.1 s per GB, on
+virtual machines up to 2.5 s: more than the arithmetic of stages that go through all visibilities. Larger arrays may be
+zeros that nobody reads, as the polarization of a sky, and take no memory of the system. `release_memory` gives back
+what is free."""
 
 
 def release_memory() -> None:
