@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import re
 import threading
@@ -49,26 +48,6 @@ def parse_memory(text: str) -> float:
 def resident_memory() -> int:
     """Return the resident memory of this process in bytes."""
     return psutil.Process().memory_info().rss
-
-
-ALLOCATION = {
-    "GLIBC_TUNABLES": ":".join(
-        f"glibc.malloc.{name}={value}"
-        for name, value in {"mmap_threshold": 1 << 29, "trim_threshold": 1 << 40, "arena_max": 1, "hugetlb": 1}.items()
-    )
-}
-"""Environment of a process whose arrays of up to half a GB take the memory of freed ones, by glibc 2.35 and later.
-
-By default glibc asks the system for the memory of each array above some MB. To hand it out takes 0.1 s per GB, on
-virtual machines up to 2.5 s: more than the arithmetic of stages that go through all visibilities. Larger arrays may be
-zeros that nobody reads, as the polarization of a sky, and take no memory of the system. `release_memory` gives back
-what is free."""
-
-
-def release_memory() -> None:
-    """Give memory that this process has freed back to the system, where the C library can (glibc)."""
-    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
-        trim(0)
 
 
 def cpu_time() -> float:

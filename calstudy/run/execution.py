@@ -25,7 +25,7 @@ from calstudy.base.errors import DiskError, InputError, refusal_of_disk
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.quiet import errors_written_to, write_errors_to
-from calstudy.base.resources import ALLOCATION, Usage, cores, free_memory, parse_memory, release_memory
+from calstudy.base.resources import Usage, cores, free_memory, parse_memory
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
 from calstudy.run.store import Product, Store
 from calstudy.run.task import Task, unique
@@ -347,7 +347,7 @@ def _local_client(workers: int, log: Path) -> Iterator[Client]:
     threads = str(max(1, cores() // workers))
     environment = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "TF_NUM_INTRAOP_THREADS"), threads)
     settings = {
-        "distributed.nanny.pre-spawn-environ": environment | ({} if set(ALLOCATION) & set(os.environ) else ALLOCATION),
+        "distributed.nanny.pre-spawn-environ": environment,
         "distributed.admin.tick.limit": "10 m",
         # Nobody looks at dask's own profile and load; every 10 ms, and 500 ms, they take time from the work.
         "distributed.worker.profile.enabled": False,
@@ -417,11 +417,7 @@ def _announce_and_perform(order: WorkOrder) -> Product:
 
     worker = get_worker()
     worker.log_event(BEGUN, {"worker": worker.address, "product": order.name})
-    try:
-        return perform(order, lambda text: worker.log_event(WAITS, text))
-    finally:
-        # The next product of another worker may need it.
-        release_memory()
+    return perform(order, lambda text: worker.log_event(WAITS, text))
 
 
 def _last_begun(client: Client, worker: str) -> str | None:
