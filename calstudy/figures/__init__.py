@@ -7,7 +7,7 @@ A `StudyFigure` declares all that the rest of the package needs to know about it
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -26,7 +26,7 @@ from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
 from calstudy.products.spectra import spectra
 from calstudy.run.task import Inputs, Job, Task
-from calstudy.verdicts.tolerances import Drawn, Rules, spread_of_scale
+from calstudy.verdicts.tolerances import BY_OWN_ERROR, ERROR_OF_ERROR, Arrays, Drawn, Rules, spread_of_scale
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -181,8 +181,26 @@ class InspectedFigure(StudyFigure):
         return {"gains": corruption.gains(graph), "calibration": fitted}
 
 
-def _error_of_transfer(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+CONVERGED, MOST = "converged", 0.5
+"""Name of the array with the fraction of the solves of a case that converged, and the least fraction of a result."""
+
+
+def _error_of_transfer(arrays: Arrays, name: str) -> np.ndarray:
     return arrays[name.replace("cross_transfer", "transfer_error")]
+
+
+def _tenth(arrays: Arrays, name: str) -> np.ndarray:
+    return np.full(np.shape(arrays[name]), 0.1)
+
+
+def _of_solutions(error: Callable[[Arrays, str], np.ndarray]) -> Callable[[Arrays, str], np.ndarray]:
+    """Make an error infinite in a case of which most solves did not converge: it depends on where they stopped."""
+
+    def found(arrays: Arrays, name: str) -> np.ndarray:
+        share = arrays.get(f"{name.rpartition('.')[0]}.{CONVERGED}", 1.0)
+        return error(arrays, name) if share >= MOST else np.full(np.shape(arrays[name]), np.inf)
+
+    return found
 
 
 class CasesFigure(StudyFigure):
@@ -192,13 +210,17 @@ class CasesFigure(StudyFigure):
     ----------
     scores
         The scores that it shows, and saves as its arrays: those in ``bands`` of k, or in the experiment's ``bins``.
+        The fraction of solves that converged is saved beside them.
     """
 
     of = ("comparison",)
     scores: ClassVar[Literal["bands", "bins"]] = "bands"
     tolerances = (
-        (r".*\.flux_scale", Drawn(spread_of_scale, "the flux scale of other noise")),
-        (r".*\.cross_transfer", Drawn(_error_of_transfer, "the error of T, of which C has no other")),
+        (r".*\.flux_scale", Drawn(_of_solutions(spread_of_scale), "the flux scale of other noise")),
+        (r".*\.cross_transfer", Drawn(_of_solutions(_error_of_transfer), "the error of T, of which C has no other")),
+        (rf".*\.{CONVERGED}", Drawn(_tenth, "rounding decides how a few solves end; a tenth", largest=3.0)),
+        (r".*_error", Drawn(_of_solutions(ERROR_OF_ERROR.error), ERROR_OF_ERROR.why)),
+        (r".*\.(transfer|bias|recovered)", Drawn(_of_solutions(BY_OWN_ERROR.error), BY_OWN_ERROR.why)),
     )
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
@@ -221,7 +243,10 @@ class CasesFigure(StudyFigure):
         """Read the scores, and draw them."""
         cases = read_cases(job.settings["calibrators"], job.settings["worlds"], job.inputs)
         shown = {
-            world: {name: getattr(case, self.scores) for name, case in found.items()} for world, found in cases.items()
+            world: {
+                name: {**vars(getattr(case, self.scores)), CONVERGED: case.converged} for name, case in found.items()
+            }
+            for world, found in cases.items()
         }
         return Drawing(self.draw_cases(cases, job), shown)
 

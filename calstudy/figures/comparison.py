@@ -106,8 +106,9 @@ def _scale(axes: Axes, name: str, cases: Iterable[Case]) -> None:
 class ComparisonSpectra(CasesFigure):
     """P^R / P^S and s^2 P^R0 / P^S of every calibrator against k, a row for each world."""
 
-    kind: str = "comparison-spectra"
+    version: ClassVar[int] = 2
 
+    kind: str = "comparison-spectra"
     caption = "Recovered power (left) and bias (right) outside the wedge in units of the EoR, with 95 % bars."
     scores = "bins"
 
@@ -159,8 +160,9 @@ def _in_band(found: Mapping[str, Case], name: str, band: int) -> np.ndarray:
 class ComparisonCurves(CasesFigure):
     """T and bias of calibrators that are values of one setting, in bands of k; a curve for each world."""
 
-    kind: str = "comparison-curves"
+    version: ClassVar[int] = 2
 
+    kind: str = "comparison-curves"
     caption = "Transfer function and bias outside the wedge from one calibrator to the next, with 95 % bars."
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
@@ -284,7 +286,7 @@ def _draw_panel(
 class ComparisonVariants(CasesFigure):
     """Bias of calibrators in variants and in variants of worlds: of labels such as ``sky-based, autos``."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     kind: str = "comparison-variants"
     caption = (

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.table import number
-from calstudy.figures import CasesFigure
+from calstudy.figures import MOST, CasesFigure
 from calstudy.figures.comparison import is_limit, look
 from calstudy.plotting import style
 from calstudy.power.score import HEADLINE_BAND
@@ -48,8 +48,8 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
     """Draw a matrix for each band of k: worlds from left to right, or from top to bottom where they are many.
 
     The colour is the bias. For a bias within two standard deviations of zero, the 95 % upper limit is written and
-    coloured, and the cell is hatched; a T that is not measured is not written. `cases` are by world and calibrator; a
-    case without scores is left white and labelled.
+    coloured, and the cell is hatched; a T that is not measured is not written. A star marks a case of which most solves
+    did not converge. `cases` are by world and calibrator; a case without scores is left white and labelled.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
@@ -74,8 +74,14 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
     for axes in panels[-1]:
         _name_columns(axes, columns, LABELS_WIDTH // (across * len(columns)))
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
-    bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$; hatched: upper limit")
+    star = "; *: most solves did not converge" if any(_stars(case) for row in cells for case in row) else ""
+    bar.set_label(r"bias $s^2\,|P^{R_0}| / P^S$; hatched: upper limit" + star)
     return figure
+
+
+def _stars(case: Case | None) -> str:
+    """Return a star for a case of which most solves did not converge, else an empty text."""
+    return "*" if case is not None and case.converged < MOST else ""
 
 
 def _name_columns(axes: Axes, labels: Sequence[str], width: int) -> None:
@@ -105,7 +111,7 @@ def _draw_band(
         axes.text(
             column,
             row,
-            f"{bias}\n{_transfer(bands.transfer[band], bands.transfer_error[band], n_columns)}",
+            f"{bias}{_stars(case)}\n{_transfer(bands.transfer[band], bands.transfer_error[band], n_columns)}",
             ha="center",
             va="center",
             fontsize=style.SMALL_SIZE,
@@ -143,12 +149,12 @@ def _digits(value: float) -> str:
 class ComparisonMatrix(CasesFigure):
     """A matrix of calibrators and worlds for each band of k: colour and number are the bias, T is written below it."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     kind: str = "comparison-matrix"
     caption = (
         "Bias of every calibrator in every world, in units of the EoR (< and hatched: 95 % upper limit), and the part "
-        "T of the EoR that is left, if it was measured."
+        "T of the EoR that is left, if it was measured. Where most solves did not converge, a star says so."
     )
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
@@ -157,6 +163,8 @@ class ComparisonMatrix(CasesFigure):
 
 
 FAULT_HEIGHT = 1.7
+CROSS: dict[str, Any] = {"color": style.BLACK, "marker": "x", "markersize": 7, "linestyle": "", "zorder": 3}
+"""Over cases of which most solves did not converge."""
 LINEAR = 0.01
 """The axis of the bias is linear up to this, and logarithmic beyond."""
 ZERO = 0.3
@@ -172,9 +180,9 @@ def draw_tolerances(
 ) -> Figure:
     """Draw the bias on the left and T on the right against the severity of each fault, with 95 % bars.
 
-    Both are in the band of k in which tolerances are judged. The dashed line is the bias that is tolerated. `cases` are
-    by world and calibrator. The level of the EoR, dB of amplitude over the foregrounds, is None if cases differ in it,
-    or it is not known.
+    Both are in the band of k in which tolerances are judged. The dashed line is the bias that is tolerated. Crosses are
+    over cases of which most solves did not converge. `cases` are by world and calibrator. The level of the EoR, dB of
+    amplitude over the foregrounds, is None if cases differ in it, or it is not known.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + FAULT_HEIGHT * len(found))
     grid = figure.subplots(len(found), 2, squeeze=False)
@@ -198,8 +206,10 @@ def draw_tolerances(
     grid[0, 0].set_title(band + level, loc="left")
     scored = {name for found in cases.values() for name in found}
     looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
-    handles = [style.entry(linewidth=0.7, **its) for its in looks.values()]
-    figure.legend(handles, list(looks), loc="outside upper center", ncols=min(len(looks), 5))
+    handles = {name: style.entry(linewidth=0.7, **its) for name, its in looks.items()}
+    if any(case.converged < MOST for found in cases.values() for case in found.values()):
+        handles["most solves did not converge"] = style.entry(**CROSS)
+    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=min(len(handles), 5))
     return figure
 
 
@@ -212,25 +222,23 @@ def _draw_points(
     axes: Axes, fault: Fault, cases: Mapping[str, Mapping[str, Case]], calibrator: str, name: str, place: int
 ) -> None:
     there = [calibrator in cases[world] for world in fault.worlds]
-    bands = [cases[world][calibrator].bands for world in fault.worlds if calibrator in cases[world]]
-    if not bands:
+    found = [cases[world][calibrator] for world in fault.worlds if calibrator in cases[world]]
+    if not found:
         return
+    bands = [case.bands for case in found]
     band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - HEADLINE_BAND[0])))
     values, errors = (np.array([getattr(item, column)[band] for item in bands]) for column in (name, f"{name}_error"))
-    axes.errorbar(
-        _positions(fault)[there],
-        values,
-        yerr=SIGMAS_95 * np.nan_to_num(errors),
-        elinewidth=0.6,
-        linewidth=0.7,
-        **look(place),
-    )
+    positions = _positions(fault)[there]
+    bars = SIGMAS_95 * np.nan_to_num(errors)
+    axes.errorbar(positions, values, yerr=bars, elinewidth=0.6, linewidth=0.7, **look(place))
+    lost = [case.converged < MOST for case in found]
+    axes.plot(positions[lost], values[lost], **CROSS)
 
 
 class ComparisonTolerances(CasesFigure):
     """Bias and T against the severity of each fault: of worlds with labels such as ``positions: 2 cm``."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     kind: str = "comparison-tolerances"
     caption = (

@@ -21,7 +21,16 @@ from calstudy.products.graph import size_of
 from calstudy.products.signal_loss import statuses
 from calstudy.products.tolerances import COUNTS, faults, tolerance
 from calstudy.run.task import Inputs, Task
-from calstudy.verdicts.standing import LIMIT, advice, is_measured, marked, standing_table, standings, upper_limit
+from calstudy.verdicts.standing import (
+    LIMIT,
+    advice,
+    is_measured,
+    marked,
+    settled,
+    standing_table,
+    standings,
+    upper_limit,
+)
 
 CSV, MARKDOWN = "comparison.csv", "comparison.md"
 QUANTITIES = {"transfer": "T", "bias": "bias", "recovered": "P^R / P^S"}
@@ -47,6 +56,12 @@ class Case:
     bins: Score
     bands: Score
     summary: Mapping[str, Any]
+
+    @property
+    def converged(self) -> float:
+        """Fraction of its solves that ended at a solution."""
+        solves = self.summary["by_status"]
+        return settled(solves) / max(1, sum(solves.values()))
 
 
 def case_name(world: int, calibrator: int) -> str:

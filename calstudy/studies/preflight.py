@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
@@ -30,6 +31,8 @@ from calstudy.sky.settings import Eor, FileSources, Foregrounds, GleamSources, P
 
 LONG_AVERAGE = 15.0
 """Minutes; the sky moves by a sixth of the beam of an MWA tile."""
+APERTURE = 5.0
+"""Width of antennas, which see multipoles about that of their baseline, m."""
 SNAPSHOTS = 0.02
 """Of 1 + z: how far coeval boxes of 21cmFAST are apart by default."""
 
@@ -38,15 +41,28 @@ def require_possible(experiment: Experiment) -> None:
     """Raise InputError if a beam or the EoR cannot be made, or an effect or the calibrator refuses the data."""
     require_beams(experiment.instrument)
     _require_small_errors(experiment.instrument)
-    _require_eor(experiment.sky.eor, experiment.instrument.channels.band)
+    _require_eor(experiment.sky.eor, experiment.instrument)
     require_usable(experiment.corruption.effects, size_of_instrument(experiment.instrument))
     numbers = make_array(experiment.instrument).numbers
     require_antennas(experiment.power, numbers, "give other numbers in instrument.layout.path")
     require_calibration(experiment)
 
 
-def _require_eor(eor: Eor, band: tuple[float, float]) -> None:
-    """Raise InputError if a table or a box cannot be used for a band."""
+def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
+    """Raise InputError if a table or a box cannot be used for a band, or maps lack what long baselines see.
+
+    Maps of a spectrum that is not flat end at l = 3 nside - 1. Beyond it baselines see replicas of what is below, with
+    a sixth to all of the power of the spectrum.
+    """
+    band = instrument.channels.band
+    longest = frame_of(instrument).lengths.max(initial=0.0)
+    seen = 2 * math.pi * (longest + APERTURE) * band[1] / SPEED_OF_LIGHT
+    if eor.spectrum != "flat" and seen > 3 * eor.nside - 1:
+        enough = 2 ** math.ceil(math.log2((seen + 1) / 3))
+        raise InputError(
+            f"sky.eor.nside = {eor.nside}: maps of a {eor.spectrum} spectrum have multipoles up to {3 * eor.nside - 1} "
+            f"and baselines of {longest:.0f} m see multipoles up to {seen:.0f}; give at least {enough}"
+        )
     if eor.path is None:
         return
     if eor.spectrum == "box":

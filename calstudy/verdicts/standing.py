@@ -51,6 +51,11 @@ def marked(text: str, transfer: float | None, error: float | None) -> str:
     return f"not measured ({text})" if why_not_measured(transfer, error) else text
 
 
+def settled(solves: Mapping[str, int]) -> int:
+    """Return how many solves ended at a solution, of their numbers by status."""
+    return sum(solves.get(status, 0) for status in SETTLED)
+
+
 Standing = Literal["passes", "open", "fails"]
 WORST = ("fails", "open", "passes")
 LIMIT = 0.1
@@ -59,6 +64,8 @@ SIGMAS = 2.0
 AT_LIMIT, OUT_OF_REACH = 1.05, 1000.0
 """Factors by which errors must be smaller to tell: below the first the bias is near the limit; those beyond the second
 are not named."""
+SETTLED = ("converged", "by-file")
+"""Statuses of solves that are no reason for doubt, as in `calstudy.calibrate.records`."""
 NAMED = 3
 """Number of worlds, and of calibrators that fail in few, that are named; others are counted."""
 MORE = 0.02
@@ -172,7 +179,7 @@ class InBand:
     def _not_converged(self) -> str:
         """How many solves of all worlds did not converge; nothing if all did."""
         count = sum(sum(world.solves.values()) for world in self.worlds)
-        rest = count - sum(world.solves.get("converged", 0) for world in self.worlds)
+        rest = count - sum(settled(world.solves) for world in self.worlds)
         return f", {rest} of {count} solves not converged" if rest else ""
 
     def __str__(self) -> str:

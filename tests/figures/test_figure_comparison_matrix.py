@@ -101,5 +101,21 @@ def test_each_cell_is_of_its_world_and_calibrator(worlds):
         assert text.get_text().startswith("no scores" if found is None else f"bias {found.bands.bias[0]:.2g}")
 
 
+@pytest.mark.parametrize(
+    ("solves", "star"),
+    [
+        ({"converged": 4}, ""),
+        ({"by-file": 4}, ""),
+        ({"converged": 2, "stalled": 2}, ""),
+        ({"converged": 1, "max-steps": 1, "stalled": 2}, "*"),
+        ({"max-steps": 4}, "*"),
+    ],
+)
+def test_a_star_marks_a_case_of_which_most_solves_did_not_converge(solves, star):
+    figure = draw({"one": case(bias=3.0, **solves), "two": case()})
+    assert [text.get_text().split("\n")[0] for text in figure.axes[0].texts] == [f"bias 3{star}", "bias 1"]
+    assert ("*: most solves did not converge" in figure.axes[-1].get_ylabel()) == bool(star)
+
+
 def test_the_caption_says_what_the_sign_means():
     assert re.search(r"< and hatched: 95 % upper limit", FIGURES.make("comparison-matrix").caption)

@@ -27,6 +27,7 @@ from calstudy.regression import (
     read_reference,
     read_run,
     remake,
+    rules_of,
     show,
 )
 from calstudy.run.execution import Budget
@@ -167,6 +168,24 @@ def test_a_small_loss_at_all_scales_shows_in_the_mean():
     assert lost.largest < 2
     assert lost.shift == pytest.approx(-0.1 * 20 / (np.sqrt(2) * 0.1), rel=0.02)
     assert lost.status == "beyond"
+
+
+@pytest.mark.parametrize(("converged", "status"), [(None, "beyond"), (1.0, "beyond"), (0.5, "beyond"), (0.4, "moved")])
+def test_scores_of_fits_without_a_solution_depend_on_where_they_stopped(converged, status):
+    reference = {name: np.array([1.0, 2.0]) for name in ("w.c.transfer", "w.c.bias", "w.c.cross_transfer")}
+    reference |= {f"{name}_error": np.array([0.1, 0.1]) for name in ("w.c.transfer", "w.c.bias")}
+    reference["w.c.flux_scale"] = np.array(1.0)
+    if converged is not None:
+        reference["w.c.converged"] = np.array(converged)
+    rules = rules_of("comparison-matrix")
+    for name in ("w.c.transfer", "w.c.bias", "w.c.bias_error", "w.c.cross_transfer", "w.c.flux_scale"):
+        assert compare_array("comparison-matrix", name, reference, 50 * reference[name], rules).status == status
+
+
+def test_solves_that_no_longer_converge_are_beyond_the_tolerance():
+    reference = {"w.c.converged": np.array(1.0)}
+    assert compare_array("comparison-matrix", "w.c.converged", reference, np.array(0.9)).status == "moved"
+    assert compare_array("comparison-matrix", "w.c.converged", reference, np.array(0.5)).status == "beyond"
 
 
 def test_what_is_missing_new_or_of_another_shape_is_told():
