@@ -25,12 +25,10 @@ from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin, get_type_hints
 
-import yaml
-
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.gains import draw_gains, read_gain_errors
 from calstudy.base.schema import alternatives
-from calstudy.experiment.files import StudyFile
+from calstudy.experiment.files import StudyFile, dump_yaml
 from calstudy.figures import Draw
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
@@ -383,7 +381,7 @@ class OpenRun:
         """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
 
         Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
-        limit in these worlds in units of the EoR, and `transfer`, the smallest T.
+        limit in all worlds in units of the EoR, and `transfer`, the smallest T.
         """
         import pandas
 
@@ -434,7 +432,11 @@ class OpenRun:
         import pandas
 
         listed = f"{nearest(name, self.tables)} (there are: {', '.join(self.tables)})"
-        return pandas.read_csv(self._folder.tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}"))
+        path = self._folder.tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}")
+        # A line above the header describes the sky model; cells may have the sign as well.
+        with path.open(encoding="utf-8") as file:
+            is_described = file.readline().startswith("# ")
+        return pandas.read_csv(path, skiprows=int(is_described))
 
     @property
     def parts(self) -> dict[str, OpenRun]:
@@ -566,12 +568,14 @@ class OpenRun:
         above = self.folder.resolve().parents
         if store.is_absolute() or runs.is_absolute() or len(above) <= len(runs.parts):
             return [Store(store)]
-        return [Store(store), Store(above[len(runs.parts)] / store)]
+        # A point is deeper in the folder of runs, which may also have been renamed.
+        started = next((folder for folder in above if folder / runs in above), above[len(runs.parts)])
+        return [Store(store), Store(started / store)]
 
 
 def _overrides(changes: Mapping[str, Any], section: str = "") -> list[str]:
     plain = _plain(changes)
-    return [f"{section}{path}={yaml.safe_dump(value, default_flow_style=True)}" for path, value in plain.items()]
+    return [f"{section}{path}={dump_yaml(value, in_line=True)}" for path, value in plain.items()]
 
 
 def _plain(value: Any, path: str = "") -> Any:

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import ValidationError
 from rich.console import Console
 
 from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.files import replacing
 from calstudy.base.table import Table
+from calstudy.experiment.files import dump_yaml
 from calstudy.experiment.model import FIGURES
 from calstudy.results.reader import EXPERIMENT, MANIFEST, NO_RUN, RunFolder
 from calstudy.run.execution import Budget
@@ -71,9 +71,10 @@ def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]
 
     A user's figure that no longer exists has none, so that its arrays may not move at all.
     """
-    named = experiment.get("figures", (experiment.get("outputs") or {}).get("figures", ()))
+    named = experiment.get("figures", (experiment.get("outputs") or {}).get("figures"))
     found = {}
-    for block in named:
+    # The default figures, of a study of measured data, are null there; `rules_of` finds their tolerances by name.
+    for block in named or ():
         try:
             figure = FIGURES.make(block, folder=folder)
         except (InputError, ValidationError):
@@ -121,7 +122,7 @@ def accept(run: Path, reference: Path) -> None:
         if "members" in manifest:
             beside = {**manifest, "members": {name: name for name in manifest["members"]}}
             contents[MANIFEST] = json.dumps(beside, indent=1).encode()
-        description = yaml.safe_dump(_experiment(run), sort_keys=False, allow_unicode=True, width=100)
+        description = dump_yaml(_experiment(run))
     except (OSError, ValueError) as error:
         raise InputError(f"{run}: cannot be read ({error})") from None
     with errors_of_files(f"{reference}: cannot be written"):

@@ -12,6 +12,7 @@ import pytest
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import experiment_names, find_experiment, published, reference_folder
+from calstudy.experiment.files import StudyFile
 
 pytestmark = pytest.mark.chain
 
@@ -39,6 +40,15 @@ def test_a_file_comes_before_a_published_experiment_of_its_name(monkeypatch, tmp
         InputError, match=r"quickstrat: neither a file nor a published experiment, did you mean 'quickstart'\?"
     ):
         find_experiment(Path("quickstrat"))
+
+
+def test_a_folder_does_not_hide_a_published_experiment_of_its_name(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for name in ("checks", "mine"):
+        Path(name).mkdir()
+    assert find_experiment(Path("checks")) == ROOT / "experiments" / "checks.yaml"
+    with pytest.raises(InputError, match="mine: is a folder, not a file"):
+        StudyFile.open(Path("mine"))
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from tiny import tiny
 
 import calstudy
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.experiment.model import Folders
 from calstudy.power.spectra import CylindricalSpectrum, SphericalSpectrum
 from calstudy.power.tables import load_spectrum
 from calstudy.products.calibration import Calibrate
@@ -251,3 +252,25 @@ def test_a_run_of_an_older_version_says_so(run, tmp_path):
     (tmp_path / "experiment.yaml").write_text(older, encoding="utf-8")
     with pytest.raises(InputError, match=r"written on .* by .*; this version refuses it.*\(calibration.skip_flagged"):
         calstudy.open_run(tmp_path).gains("residual")
+
+
+def test_a_line_above_the_header_of_a_table_is_no_header(tmp_path):
+    (tmp_path / "manifest.json").write_text('{"name": "mine"}')
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "sky-model.csv").write_text("# sky model: a file, of few sources\nfield,true\nbeam,# 3\n")
+    (tmp_path / "tables" / "plain.csv").write_text("#,true\n1,2\n")
+    run = calstudy.open_run(tmp_path)
+    assert run.table("sky-model").to_dict("records") == [{"field": "beam", "true": "# 3"}]
+    assert run.table("plain").to_dict("records") == [{"#": 1, "true": 2}]
+
+
+@pytest.mark.parametrize("place", ["runs/mine", "runs/sweep-x/points/01-a", "renamed/mine"])
+def test_the_store_is_beside_the_folder_of_runs(tmp_path, place):
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / place / "manifest.json").write_text('{"name": "mine"}')
+    stores = calstudy.open_run(tmp_path / place)._stores(Folders())
+    assert [store.root for store in stores] == [Path("store").resolve(), tmp_path / "store"]
+
+
+def test_texts_that_look_like_numbers_stay_texts():
+    assert calstudy.load({"name": "mine"}, description="1e-3").experiment.description == "1e-3"

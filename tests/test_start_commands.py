@@ -19,7 +19,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.package_files import experiment_names, published
 from calstudy.cli import main as cli
 from calstudy.experiment.files import dump, override, parse_yaml, validate
-from calstudy.run.store import Store
+from calstudy.run.store import Lease, Product, Store
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import SCHEMA_FILE, experiment_schema
 
@@ -320,7 +320,9 @@ def test_no_file_is_written_about_one_integration(here, capsys):
     data = UVData.from_file(Path(hera_qm.__file__).parent / "data" / "zen.2457698.40355.xx.HH.uvh5")
     data.select(times=np.unique(data.time_array)[:1])
     data.write_uvh5("one.uvh5")
-    with pytest.raises(InputError, match=r"--data: one.uvh5 has 1 integration, and a study needs two"):
+    with pytest.raises(
+        InputError, match=r"has 1 integration, and a study needs two.*observed.odd.*observed.difference"
+    ):
         output_of(capsys, "init", "mine", "--data", "one.uvh5")
     assert not (here / "mine.yaml").exists()
 
@@ -342,6 +344,19 @@ def test_a_file_about_measured_data_is_valid_and_proposes_what_is_quiet_and_aliv
     assert (facts.frequencies.size, facts.antennas) == (126, 18)
 
 
+def test_antennas_are_proposed_by_number_where_their_names_are_the_numbers_of_others(here, capsys):
+    import hera_qm
+
+    data = UVData.from_file(Path(hera_qm.__file__).parent / "data" / "zen.2457698.40355.xx.HH.uvh5")
+    data.telescope.antenna_names = np.roll(data.telescope.antenna_numbers, 1).astype(str)
+    data.write_uvh5("named.uvh5")
+    output_of(capsys, "init", "mine", "--data", "named.uvh5")
+    antennas = parse_yaml((here / "mine.yaml").read_text(), "mine")["observed"]["select"]["antennas"].split(",")
+    assert all(text.startswith("number:") for text in antennas)
+    numbers = load_study(here / "mine.yaml").graph.parts.facts["even"].frame.numbers
+    assert [f"number:{number}" for number in numbers] == antennas
+
+
 def test_all_channels_and_antennas_are_proposed_where_none_stands_out_or_data_are_large(here, capsys, monkeypatch):
     import hera_qm
 
@@ -355,3 +370,34 @@ def test_all_channels_and_antennas_are_proposed_where_none_stands_out_or_data_ar
         assert parse_yaml(text, "mine")["observed"]["select"] == {"frequencies": "139.453 MHz..143.262 MHz"}
         (here / "mine.yaml").unlink()
         monkeypatch.setattr("calstudy.cli.start.LARGE", 1.0)
+
+
+def test_what_a_run_removes_while_a_store_is_verified_is_not_damaged(used_store, capsys, monkeypatch):
+    def removed_later(store: Store) -> list[tuple[str, str]]:
+        found = [("average", key_of(name)) for name in "abcd"]
+        store.remove(*found[0])
+        return found
+
+    monkeypatch.setattr(Store, "addresses", removed_later)
+    assert "0 damaged" in output_of(capsys, "store", "--verify")
+
+
+def test_what_is_damaged_and_needed_by_a_run_is_not_deleted(used_store, capsys):
+    (used_store.folder("average", key_of("a")) / "data.bin").write_bytes(b"y" * 1000)
+    with Lease(used_store).holding([key_of("a")]):
+        assert cli.app(["store", "--verify", "--delete"], standalone_mode=False) == 1
+    assert f"kept, for a run needs it: average {key_of('a')}" in capsys.readouterr().out
+    assert keys(used_store) == {"a", "b", "c", "d"}
+
+
+def test_what_a_run_made_again_while_a_store_is_verified_is_not_deleted(used_store, capsys, monkeypatch):
+    look, looked = Store.verify, []
+
+    def damaged_at_first(store: Store, stage: str, key: str) -> Product | None:
+        looked.append(key)
+        return None if looked == [key_of("a")] else look(store, stage, key)
+
+    monkeypatch.setattr(Store, "verify", damaged_at_first)
+    assert cli.app(["store", "--verify", "--delete"], standalone_mode=False) == 1
+    assert f"no longer damaged: average {key_of('a')}" in capsys.readouterr().out
+    assert keys(used_store) == {"a", "b", "c", "d"}

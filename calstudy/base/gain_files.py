@@ -21,6 +21,7 @@ import numpy as np
 
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
+from calstudy.base.feeds import X_IN_FILE, renamed, with_feeds_of, x_in_file
 from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gains import known_gains
 
@@ -95,6 +96,8 @@ class GainTable:
         if feeds is None:
             given = template.jones_array if hasattr(template, "jones_array") else template.polarization_array
             feeds = np.array([feed for feed in given if feed in PARALLEL_HANDS.values()])
+        elif X_IN_FILE in template.extra_keywords:
+            feeds = renamed(feeds)
         own = self.frequencies is not None and self.gains.shape[1] > 1
         n_antennas, n_channels, n_times, _ = self.gains.shape
         shape = (n_antennas, n_channels if own else template.Nfreqs, n_times, len(feeds))
@@ -176,13 +179,13 @@ Reader = Callable[["Path"], GainTable]
 def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -> UVCal:
     """Read gains in any format; `where` names the source of the path in errors.
 
-    `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Raises InputError
-    if the file does not exist, has none of the formats, takes data from other files, does not fit the template, or is a
-    CASA table and the package that reads it is missing.
+    `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Feeds have the
+    names that they have there. Raises InputError if the file does not exist, has none of the formats, takes data from
+    other files, does not fit the template, or is a CASA table and the package that reads it is missing.
     """
-    found = read_gain_file(path, where)
+    found = read_gain_file(path, where, None if template is None else x_in_file(template))
     if not isinstance(found, GainTable):
-        return found
+        return found if template is None else with_feeds_of(found, template)
     if template is None:
         raise InputError(f"{where} = {str(path)!r}: needs the data that it is for; give a CalH5 file")
     try:
@@ -192,8 +195,11 @@ def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -
         raise InputError(f"{where} = {str(path)!r}: {error}") from None
 
 
-def read_gain_file(path: Path, where: str) -> UVCal | GainTable:
-    """Read gains without the data that they are for; see `read_gains`."""
+def read_gain_file(path: Path, where: str, x: str | None = None) -> UVCal | GainTable:
+    """Read gains without the data that they are for; see `read_gains`.
+
+    `x` is the direction of feeds x in CASA tables, which need not tell it: "east" by default, or "north".
+    """
     from pyuvdata import UVCal
 
     if path.is_dir() and find_spec("casacore") is None:
@@ -204,7 +210,7 @@ def read_gain_file(path: Path, where: str) -> UVCal | GainTable:
     kind = "CASA table of gains" if path.is_dir() else "file of CalH5, calfits, H5Parm, hyperdrive or calibrate"
     try:
         if (reader := find_reader(path)) is None:
-            return UVCal.from_file(str(path))
+            return UVCal.from_file(str(path), default_x_orientation=x)
         kind, read = reader
         return read(path)
     # The readers raise the errors of their libraries; the user must correct a file that cannot be read.

@@ -48,10 +48,13 @@ def find_experiment(path: Path) -> Path:
 
     Raises InputError if it is a name without suffix or folder, and neither a file nor a published experiment.
     """
-    if path.exists() or path.name != str(path) or path.suffix:
+    is_there = path.exists()
+    if (is_there and not path.is_dir()) or path.name != str(path) or path.suffix:
         return path
     if path.name in (names := experiment_names()):
         return published("experiments") / f"{path.name}.yaml"
+    if is_there:
+        return path  # Its reader says that it is a folder.
     hint = nearest(path.name, names)
     raise InputError(f"{path}: neither a file nor a published experiment{hint} (there are: {', '.join(names)})")
 

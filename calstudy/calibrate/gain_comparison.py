@@ -22,6 +22,7 @@ import numpy as np
 from pyuvdata import UVCal
 
 from calstudy.base.errors import InputError
+from calstudy.base.feeds import with_feeds_of
 from calstudy.base.gains import SAME_CHANNEL, ErrorsOfFile, closest_solutions, known_gains, solution_times
 from calstudy.base.visibilities import polarization_names, positions
 from calstudy.calibrate.agreement import LIMITS, TAPER, aligned_gains
@@ -129,10 +130,11 @@ def pair_gains(
     """Select the gains that two files have in common, and combine their errors.
 
     Gains may be of either convention. An integration of the first is compared with the closest of the second.
-    `polarization` is the index among the feeds that both have. Errors have the axes of the gains. The files are from
-    `calstudy.base.gains.at_common_channels`. Raises InputError if the two have no antennas, no such feed, or not the
-    same channels in common.
+    `polarization` is the index among the feeds that both have, as the first calls them. Errors have the axes of the
+    gains. The files are from `calstudy.base.gains.at_common_channels`. Raises InputError if the two have no antennas,
+    no such feed, or not the same channels in common.
     """
+    second = with_feeds_of(second, first)
     numbers = np.intersect1d(first.ant_array, second.ant_array)
     feeds = [int(feed) for feed in first.jones_array if feed in second.jones_array]
     if not numbers.size:

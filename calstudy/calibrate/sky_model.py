@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.feeds import with_feeds_of
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.visibilities import from_cube, polarization_names, positions, to_cube
 
@@ -85,11 +86,13 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
 
 
 def match_sky_model(sky: UVData, data: UVData) -> UVData:
-    """Select the samples of prepared data from a prepared sky model, in their order.
+    """Select the samples of prepared data, whose channels ascend, from a sky model, in their order.
 
-    Raises InputError if baselines, integrations, channels or polarizations of the data are missing from the sky model.
+    Feeds are those of the same directions. Raises InputError if baselines, integrations, channels or polarizations of
+    the data are missing from the sky model.
     """
-    sky = sky.copy()
+    sky = with_feeds_of(sky, data).copy()
+    sky.reorder_freqs(channel_order="freq", spw_order="freq", run_check=False)
     wanted = np.unique(data.baseline_array)
     reverse = data.antnums_to_baseline(sky.ant_2_array, sky.ant_1_array)
     turned = np.flatnonzero(~np.isin(sky.baseline_array, wanted) & np.isin(reverse, wanted))

@@ -14,6 +14,7 @@ import numpy as np
 from pyuvdata import UVData, UVFlag
 
 from calstudy.base.errors import InputError
+from calstudy.base.feeds import with_feeds_of
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import positions
@@ -105,7 +106,7 @@ def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:
 def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
     """Return the file's weights in the order of the data, shape (Ntimes, Nbls, Nfreqs, Npols)."""
     where = f"weights.path = {str(settings.path)!r}"
-    file = _read_uvflag(settings.path, where)
+    file = with_feeds_of(_read_uvflag(settings.path, where), data.uvd)
     values = file.metric_array if file.mode == "metric" else ~file.flag_array
     if np.iscomplexobj(values):
         raise InputError(f"{where}: weights must be real, these are complex")
@@ -114,13 +115,14 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
     if file.Nfreqs != data.n_channels or not np.allclose(file.freq_array, data.frequencies, rtol=1e-9, atol=0):
         raise InputError(f"{where}: the channels of the weights are not those of the data")
     rows = {key: row for row, key in enumerate(_keys(file))}
-    wanted = _keys(data.uvd)
-    if any(key not in rows for key in wanted):
+    wanted, flagged = _keys(data.uvd), data.flags.all(axis=(2, 3)).ravel()
+    if any(key not in rows for key, without in zip(wanted, flagged, strict=True) if not without):
         raise InputError(f"{where}: no weights for some baselines or integrations of the data")
     hands = [np.flatnonzero(file.polarization_array == pol) for pol in data.polarizations]
     if any(hand.size != 1 for hand in hands):
         raise InputError(f"{where}: no weights for some polarizations of the data")
-    found = values[[rows[key] for key in wanted]][:, :, np.concatenate(hands)]
+    # The weights of flagged samples are not used.
+    found = values[[rows.get(key, 0) for key in wanted]][:, :, np.concatenate(hands)]
     return found.astype(float).reshape(data.shape)
 
 

@@ -131,8 +131,13 @@ def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
 
 
 def difference_of_losses(first: Results, second: Results, k_min: float, k_max: float = np.inf) -> Finding:
-    """Return T free of the flux scale of one run minus that of another, over bins from `k_min` to `k_max` in h/Mpc."""
+    """Return T free of the flux scale of one run minus that of another, over bins from `k_min` to `k_max` in h/Mpc.
+
+    Raises Unevaluated if the bins of the runs differ, or none has a T.
+    """
     one, other = (run.transfer("outside-wedge") for run in (first, second))
+    if not np.array_equal(one.bin_edges, other.bin_edges):
+        raise Unevaluated("the transfer functions have different bins of k")
     used = (one.k >= k_min - TINY) & (one.k <= k_max)
     difference = one.scale_free_transfer - other.scale_free_transfer
     error = np.hypot(one.scale_free_transfer_error, other.scale_free_transfer_error)

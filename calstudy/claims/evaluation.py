@@ -24,7 +24,14 @@ from calstudy.results.reader import Results, RunFolder, Tables
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.statement import Statement
-from calstudy.verdicts.tables import CLAIMS_MARKDOWN, tally, write_claims, write_claims_by_solver
+from calstudy.verdicts.tables import (
+    BY_SOLVER_JSON,
+    BY_SOLVER_MARKDOWN,
+    CLAIMS_MARKDOWN,
+    tally,
+    write_claims,
+    write_claims_by_solver,
+)
 
 
 @dataclass(frozen=True)
@@ -196,6 +203,10 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
         write_claims(found.verdicts, folder, run.name, run.manifest["stand_ins"], found.without_role)
         if by_solver:
             write_claims_by_solver(by_solver, folder, run.name, run.manifest["stand_ins"])
+        else:
+            # Those of an earlier evaluation, of other members or papers.
+            for name in (BY_SOLVER_JSON, BY_SOLVER_MARKDOWN):
+                (folder / name).unlink(missing_ok=True)
     return found
 
 

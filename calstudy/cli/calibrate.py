@@ -187,7 +187,12 @@ def _calibration(path: Path | None, changes: Mapping[str, Any]) -> dict[str, Any
     if path is not None:
         content = dict(read_mapping(path, f"{CALIBRATORS.tag}: calamity"))
         section = content.get("calibration", content)
-        content = {CALIBRATORS.tag: section} if isinstance(section, str) else dict(section)
+        if not isinstance(section, str | Mapping | None):
+            raise InputError(
+                f"{path}: calibration = {section!r}: must be the name of a calibrator, or a block of keys such as "
+                f"'{CALIBRATORS.tag}: calamity'"
+            )
+        content = {CALIBRATORS.tag: section} if isinstance(section, str) else dict(section or {})
         reference = content.get(CALIBRATORS.tag)
         if isinstance(reference, str) and ".py" in reference:
             content[CALIBRATORS.tag] = str(path.parent / Path(reference).expanduser())

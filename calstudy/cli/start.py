@@ -120,8 +120,9 @@ def _described(data: str) -> dict[str, str]:
         raise InputError(f"--data: {error}") from None
     if facts.times.size < 2:
         raise InputError(
-            f"--data: {data} has 1 integration, and a study needs two, for even and odd; join it with others of the "
-            "same night, or calibrate it alone with `calstudy calibrate`"
+            f"--data: {data} has 1 integration, and a study needs two, for even and odd: join it with others of the "
+            "same night; or write a file with other data of the same sky as observed.odd, or the differences of a "
+            "correlator as observed.difference; or calibrate it alone with `calstudy calibrate`"
         )
     frame, whole = facts.frame, _band(facts.frequencies[0], facts.frequencies[-1])
     vectors = frame.vectors[~frame.autos]
@@ -145,6 +146,7 @@ def _proposed(facts: Facts, whole: str, paths: tuple[Path, ...]) -> dict[str, st
     from calstudy.realdata.interference import quiet_band
     from calstudy.realdata.noise import uncorrelated
     from calstudy.realdata.reading import prepare, read_visibilities
+    from calstudy.realdata.selection import antenna_text
 
     antennas = "# antennas: 0,1,12"
     if facts.size(facts.times.size).samples > LARGE:
@@ -159,10 +161,10 @@ def _proposed(facts: Facts, whole: str, paths: tuple[Path, ...]) -> dict[str, st
     except InputError as error:
         raise InputError(f"--data: {error}") from None
     if lost := uncorrelated(data):
-        kept = [number for number in facts.frame.numbers.tolist() if number not in lost]
+        kept = [antenna_text(data, number) for number in facts.frame.numbers.tolist() if number not in lost]
         antennas = (
             f"# All but {', '.join(map(str, lost))}, of whose cross-correlations at most one is above the noise; "
-            f"without this line: all.\n    antennas: {','.join(map(str, kept))}"
+            f"without this line: all.\n    antennas: {','.join(kept)}"
         )
     found = quiet_band(data)
     if found is None:

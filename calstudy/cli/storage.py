@@ -113,15 +113,32 @@ def _delete(chosen: list[Product], store: Store, console: Console) -> None:
 def _verify(store: Store, delete: bool) -> None:
     """Compare all products with their records; name damaged ones, and delete them on request."""
     console, addresses = Console(highlight=False, soft_wrap=True), store.addresses()
-    damaged = [address for address in addresses if store.verify(*address) is None]
+    damaged = [address for address in addresses if _is_damaged(store, *address)]
     for stage, key in damaged:
-        if delete:
-            with store.lock(stage, key):
-                store.discard(stage, key)
-        console.print(f"{'deleted' if delete else 'damaged'}: {stage} {key}", markup=False)
+        done = _discarded(store, stage, key) if delete else "damaged"
+        console.print(f"{done}: {stage} {key}", markup=False)
     console.print(f"{len(addresses)} products in {store.root}: {len(damaged)} damaged", markup=False)
     if damaged:
         raise typer.Exit(EXIT_DAMAGED)
+
+
+def _is_damaged(store: Store, stage: str, key: str) -> bool:
+    """Return whether a product differs from its record, and was not removed by a run in the meantime."""
+    return store.verify(stage, key) is None and store.exists(stage, key)
+
+
+def _discarded(store: Store, stage: str, key: str) -> str:
+    """Remove a product if it is still damaged and no run needs it; say in words what was done."""
+    from calstudy.run.store import LEASE_LOCK, needed_by_runs
+
+    with store.lock(*LEASE_LOCK):
+        if key in needed_by_runs(store):
+            return "kept, for a run needs it"
+        with store.lock(stage, key):
+            if not _is_damaged(store, stage, key):
+                return "no longer damaged"
+            store.discard(stage, key)
+    return "deleted"
 
 
 def _show(chosen: list[Product], folder: Path, console: Console) -> None:

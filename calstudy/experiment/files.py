@@ -42,11 +42,13 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
-    list("-+0123456789."),
-)
+class _Dumper(yaml.SafeDumper):
+    """Safe YAML that quotes the texts which `_Loader` would read as numbers."""
+
+
+_REAL = re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$")
+for _side in (_Loader, _Dumper):
+    _side.add_implicit_resolver("tag:yaml.org,2002:float", _REAL, list("-+0123456789."))
 OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
@@ -110,6 +112,13 @@ def parse_yaml(text: str, origin: str) -> Any:
         raise InputError(f"{origin}:{line} {_problem(error)}") from None
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{origin}: not valid YAML ({str(error).splitlines()[0]})") from None
+
+
+def dump_yaml(content: Any, in_line: bool = False) -> str:
+    """Return plain values as YAML that `parse_yaml` reads back as the same; if `in_line`, in brackets."""
+    return yaml.dump(
+        content, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100, default_flow_style=in_line
+    )
 
 
 def _problem(error: yaml.MarkedYAMLError) -> str:
@@ -372,4 +381,4 @@ def _texts(value: Any) -> Iterator[str]:
 
 def dump(content: BaseModel) -> str:
     """Return the content of a file as YAML; an experiment is read back as the same experiment."""
-    return yaml.safe_dump(content.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100)
+    return dump_yaml(content.model_dump(mode="json"))

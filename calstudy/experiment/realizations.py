@@ -125,7 +125,7 @@ def _faults(experiment: Experiment) -> list[str]:
 
 
 def _coinciding_seeds(experiment: Experiment) -> list[str]:
-    """Return a sentence if gains or noise of two realizations would have the same random numbers."""
+    """Return a sentence if gains or noise of a realization would have random numbers of another, or of other draws."""
     counts: dict[str, int] = {part: block.count for block in experiment.realizations for part in block.draw}
     noise = experiment.corruption.noise
     bases: list[tuple[str, int]] = [
@@ -134,6 +134,14 @@ def _coinciding_seeds(experiment: Experiment) -> list[str]:
     bases += [
         ("noise", seed)
         for seed in (() if isinstance(noise, NoNoise) else (*noise.seeds, *(noise.seeds_without_eor or ())))
+    ]
+    # What no realization draws again.
+    built = experiment.instrument.as_built.drawn_seeds
+    bases += [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
+    bases += [
+        (f"corruption.effects.{place}", seed)
+        for place, effect in enumerate(experiment.corruption.effects)
+        if _gain_seed(effect) is None and (seed := getattr(effect, "seed", None)) is not None
     ]
     seen: dict[int, str] = {}
     for part, base in bases:

@@ -229,9 +229,17 @@ def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpect
 
     Baselines that are completely flagged have no spectra. Those of an antenna without gains are missing in the spectra
     of the residual, but not in those of the EoR. The spectra, by name, have the same delays and their units in the same
-    order. Raise InputError if they have no unit in common or units that cannot be told apart, and ValueError if the
-    order differs.
+    order. A warning says if they are averages of different times or polarizations. Raise InputError if they have no
+    unit in common or units that cannot be told apart, and ValueError if the order differs.
     """
+    averaged = {name: (one.n_times, one.n_polarizations) for name, one in spectra.items()}
+    if len(set(averaged.values())) > 1:
+        counts = ", ".join(f"{name} {times} and {hands}" for name, (times, hands) in averaged.items())
+        logger.warning(
+            "spectra are averages of different numbers of times and polarizations (%s), because some were not "
+            "calibrated: the sample variance of the others is in their ratio, and not in its error",
+            counts,
+        )
     first, *others = keys = [one.pairs_of_units() for one in spectra.values()]
     if all(other == first for other in others):
         return dict(spectra)

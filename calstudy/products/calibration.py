@@ -139,8 +139,10 @@ class Calibrated(Task):
             data = with_autocorrelations(data, read_visibilities(self.autocorrelations / DATA, times))
             if sky is not None:
                 sky, data, _ = common_baselines(sky, data, autos=False)
-        noise = None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]
-        return data, sky, noise
+        if self.levels is None:
+            return data, sky, None
+        # The level is that of the data, and of an average of several nights not that of one.
+        return data, sky, read_json(self.levels / LEVELS)["noise_std"] * float(np.sqrt(data.nsample_array.max()))
 
 
 class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):

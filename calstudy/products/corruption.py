@@ -16,7 +16,7 @@ from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cos
 from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, positions, to_cube
 from calstudy.corrupt.interface import Effect, GainEffect, apply_effect, draw_flags, draw_truth
 from calstudy.corrupt.levels import Levels, radiometer_std, rms, set_levels
-from calstudy.corrupt.noise import NoNoise, RadiometerNoise, thermal_noise
+from calstudy.corrupt.noise import Noise, NoNoise, RadiometerNoise, thermal_noise
 from calstudy.corrupt.noise import autocorrelations as draw
 from calstudy.experiment.model import Variant
 from calstudy.instrument.as_built import AsBuilt
@@ -104,6 +104,7 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         components=sorted(variant.components),
         instrument=_antennas(graph, acting),
         noise_seed=seed,
+        nights=_nights(experiment.corruption.noise),
         effects=tuple(effects),
         flagged_by=() if effects else tuple(acting),
         levels=levels(graph),
@@ -112,6 +113,12 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         truth=truths(graph) if effects else tuple(_truth(graph, place) for place in flagging),
         temporary=not graph.keep_visibilities,
     )
+
+
+def _nights(noise: Noise) -> int | None:
+    """Return the number of nights in the average that the data are; None for one."""
+    nights = noise.nights if isinstance(noise, RadiometerNoise) else 1
+    return nights if nights > 1 else None
 
 
 @memoize
@@ -127,7 +134,7 @@ def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
         f"autocorrelations {parity}",
         instrument=graph.experiment.instrument.without_beams(),
         noise_seed=noise.seeds[PARITIES.index(parity)],
-        nights=noise.nights if isinstance(noise, RadiometerNoise) else 1,
+        nights=_nights(noise) or 1,
         levels=levels(graph),
         gains=gains(graph) if variant.effects else None,
         temporary=not graph.keep_visibilities,
@@ -249,6 +256,7 @@ class Corrupt(Task, stage="corrupt", version=2):
     components: Sequence[str]
     instrument: InstrumentSettings
     noise_seed: int | None = None
+    nights: int | None = None
     effects: tuple[Effect, ...] = ()
     flagged_by: tuple[Effect, ...] = ()
     levels: Input
@@ -278,6 +286,7 @@ class Corrupt(Task, stage="corrupt", version=2):
                 flags |= flagged
         data = from_cube(template, cube)
         flag_cube(data)[:] = flags
+        data.nsample_array[:] = self.nights or 1
         write_visibilities(data, output / DATA, single=True)
         notes: dict[str, Any] = {"rms_jy": rms(cube)}
         if flags.any():
@@ -314,7 +323,9 @@ class Autocorrelate(Task, stage="autocorrelations", version=1):
             true = read_gains(self.gains / GAINS, "true gains")
             rows = positions(true.ant_array, template.ant_1_array[: template.Nbls])
             cube = cube * np.moveaxis(np.abs(true.gain_array[rows]) ** 2, 2, 0)
-        write_visibilities(from_cube(template, cube.astype(complex)), output / DATA, single=True)
+        autos = from_cube(template, cube.astype(complex))
+        autos.nsample_array[:] = self.nights
+        write_visibilities(autos, output / DATA, single=True)
         return {}
 
     def _cost(self) -> Cost:

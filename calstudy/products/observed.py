@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.feeds import x_in_file
 from calstudy.base.gains import gain_products
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
@@ -123,11 +124,12 @@ def noise_power(graph: MeasuredGraph, what: str, source: str) -> Task:
     return cross_power(graph, noise.label, [noise, noise], own)
 
 
-class Observe(Task, stage="observe", version=4):
+class Observe(Task, stage="observe", version=5):
     """The data of one part, and the sky model.
 
     The noise is that of a sample with nsamples of one since version 2, and has the mean of inverse variances since 3.
-    Samples of no measurement are flagged since 4.
+    Samples of no measurement are flagged since 4. Windows are in the order of their frequencies since 5, and feeds that
+    were renamed are told.
     """
 
     files: Sequence[Path]
@@ -185,7 +187,8 @@ class Observe(Task, stage="observe", version=4):
             notes.append(flag_interference(data, self.interference))
         if self.sky_model is not None:
             alone = Selection(polarizations=selection.polarizations)
-            sky, sky_notes = self._prepared(read_visibilities([self.sky_model]), alone)
+            x = x_in_file(data) or "east"
+            sky, sky_notes = self._prepared(read_visibilities([self.sky_model]), alone, x=x)
             if str(sky.vis_units).lower() not in ("jy", "uncalib"):
                 raise InputError(f"sky model: is in {sky.vis_units!r}, and must be in Jy; convert it first")
             sky, data, left_out = common_baselines(sky, data, bool(self.autos))
@@ -194,12 +197,17 @@ class Observe(Task, stage="observe", version=4):
             data, sky = (uvd and interleaved(uvd, self.parity) for uvd in (data, sky))
         return data, sky, notes
 
-    def _prepared(self, data: UVData, selection: Selection, flag: Sequence[str] = ()) -> tuple[UVData, list[str]]:
-        """Return visibilities as calibration needs them, and sentences on what was changed."""
+    def _prepared(
+        self, data: UVData, selection: Selection, flag: Sequence[str] = (), x: str = "east"
+    ) -> tuple[UVData, list[str]]:
+        """Return visibilities as calibration needs them, and sentences on what was changed.
+
+        `x` is the direction of feeds x in files that do not tell it.
+        """
         from calstudy.realdata.reading import prepare
 
         try:
-            data, notes = prepare(data, selection)
+            data, notes = prepare(data, selection, x)
         except InputError as error:
             raise InputError(str(error).replace("--select ", "observed.select.")) from None
         if not self.as_given:

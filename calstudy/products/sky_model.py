@@ -107,8 +107,8 @@ class SkyModelTable(StudyTable):
         return [error(graph)] if graph.experiment.calibrates else []
 
 
-class ReadSkyModel(Task, stage="sky-model", version=1):
-    """The visibilities of a file, at the samples of the data."""
+class ReadSkyModel(Task, stage="sky-model", version=2):
+    """The visibilities of a file, at the samples of the data; of feeds by their directions since version 2."""
 
     path: Path
     instrument: InstrumentSettings

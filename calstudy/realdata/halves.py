@@ -15,6 +15,7 @@ import numpy as np
 
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
+from calstudy.base.feeds import X_IN_FILE, direction_of_x, rename_feeds
 from calstudy.base.observation import Frame
 from calstudy.base.visibilities import polarization_names
 from calstudy.calibrate.records import PARALLEL_HANDS
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 PARITIES = ("even", "odd")
 WHOLE = "whole"
 """The part that is all of the data."""
-FEED_TOLERANCE = np.radians(1)
 LEAST_CHANNELS = 8
 
 
@@ -142,12 +142,14 @@ def read_facts(
     baselines, or `even` is not satisfied.
     """
     # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
-    from calstudy.realdata.reading import place_antennas, read_metadata
+    from calstudy.realdata.reading import place_antennas, read_metadata, share_times
 
     data = read_metadata(paths)
     if positions is not None:
         place_antennas(data, positions)
-    data = select(data, selection)
+    data = select(data, replace(selection, times=None))
+    share_times(data, [])
+    # Baselines without samples at the selected times are filled with flagged ones.
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
     crosses, autos = pairs[pairs[:, 0] != pairs[:, 1]], pairs[pairs[:, 0] == pairs[:, 1], 0]
     if not len(crosses):
@@ -155,6 +157,7 @@ def read_facts(
     frequencies = np.sort(np.ravel(data.freq_array))
     if even:
         _require_even(frequencies)
+    data = select(data, Selection(times=selection.times))
     times, rows = np.unique(data.time_array, return_index=True)
     places = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
     numbers = np.unique(pairs)
@@ -315,25 +318,15 @@ def east_and_north(data: UVData) -> list[str]:
 
     Raise InputError if the feeds are not linear, or neither to the east nor to the north.
     """
-    telescope = data.telescope
     linear = bool(np.all(np.isin(data.polarization_array, (-5, -6))))
-    feeds: dict[str, set[Any]] = {"x": set(), "y": set()}
-    if linear:
-        for names, angles in zip(telescope.feed_array, telescope.feed_angle, strict=True):
-            for name, angle in zip(names, angles, strict=True):
-                feeds[str(name)].add("east" if _is(angle, np.pi / 2) else "north" if _is(angle, 0) else "other")
-    x, y = feeds["x"] or {"east"}, feeds["y"] or {"north"}
-    if linear and (x, y) == ({"east"}, {"north"}):
+    x = direction_of_x(data.telescope) if linear else None
+    if x is None:
+        raise InputError(
+            f"observed.data: polarizations {polarization_names(data.polarization_array)} of feeds that are not linear "
+            "and to the east and north; power spectra need such, for the beam is that of such feeds"
+        )
+    if x == "east":
         return []
-    if linear and feeds["x"] <= {"north"} and feeds["y"] <= {"east"}:
-        data.polarization_array = -11 - np.asarray(data.polarization_array)
-        telescope.set_feeds_from_x_orientation("east", feeds=["x", "y"], polarization_array=data.polarization_array)
-        return ["The file calls the northern feed x; it is called y here, and the eastern one x."]
-    raise InputError(
-        f"observed.data: polarizations {polarization_names(data.polarization_array)} of feeds that are not linear and "
-        "to the east and north; power spectra need such, for the beam is that of such feeds"
-    )
-
-
-def _is(angle: float, wanted: float) -> bool:
-    return abs((angle - wanted + np.pi / 2) % np.pi - np.pi / 2) < FEED_TOLERANCE
+    rename_feeds(data, "east")
+    data.extra_keywords[X_IN_FILE] = x
+    return ["The file calls the northern feed x; it is called y here, and the eastern one x."]

@@ -121,24 +121,26 @@ def _require_plausible(data: UVData, names: str) -> None:
         )
 
 
-def prepare(data: UVData, selection: Selection = EVERYTHING) -> tuple[UVData, list[str]]:
+def prepare(data: UVData, selection: Selection = EVERYTHING, x: str = "east") -> tuple[UVData, list[str]]:
     """Select, unphase, order and fill a data set, and describe each change in one sentence; the given is not changed.
 
-    The result has parallel hands only, is drift-scan, and has every baseline once at every time in time-major order;
-    samples that were missing, of no measurement or not finite are flagged. Raises InputError if nothing is left, the
-    polarizations are not of feeds, or less than half of the samples are at common times.
+    The result has parallel hands only, is drift-scan, and has every baseline once at every time in time-major order,
+    and ascending channels; samples that were missing, of no measurement or not finite are flagged. `x` is the direction
+    of feeds x in files that do not tell it. Raises InputError if nothing is left, the polarizations are not of feeds,
+    spectral windows overlap, or less than half of the samples are at common times.
     """
     notes: list[str] = []
     data = select(data, replace(selection, times=None)).copy()
     _keep_parallel_hands(data, notes)
     if data.flex_spw_polarization_array is not None:
         raise InputError("data: spectral windows of different polarizations are not supported; convert the file first")
-    _name_feeds(data, notes)
+    _name_feeds(data, x, notes)
     if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
         data.unproject_phase()
         notes.append("The data were phased to a source; they are calibrated, and written, as a drift scan.")
-    _share_times(data, notes)
-    data.reorder_freqs(channel_order="freq", run_check=False)
+    share_times(data, notes)
+    data.reorder_freqs(channel_order="freq", spw_order="freq", run_check=False)
+    _require_ascending(np.ravel(data.freq_array))
     data.reorder_blts(order="time", minor_order="baseline", run_check=False)
     data = select(_filled(data, notes), Selection(times=selection.times))
     bad = ~np.isfinite(data.data_array) & ~data.flag_array
@@ -178,18 +180,29 @@ def _keep_parallel_hands(data: UVData, notes: list[str]) -> None:
         notes.append(f"Polarizations {polarization_names(numbers[~wanted])} are not calibrated.")
 
 
-def _name_feeds(data: UVData, notes: list[str]) -> None:
+def _name_feeds(data: UVData, x: str, notes: list[str]) -> None:
     """Name the feeds of old files without names, because gains belong to feeds."""
     if data.telescope.feed_array is None:
         linear = bool(np.all(data.polarization_array <= -5))
         data.telescope.set_feeds_from_x_orientation(
-            "east", feeds=["x", "y"] if linear else ["r", "l"], polarization_array=data.polarization_array
+            x, feeds=["x", "y"] if linear else ["r", "l"], polarization_array=data.polarization_array
         )
-        notes.append("The file does not tell the orientation of its feeds; x is taken to be east.")
+        notes.append(f"The file does not tell the orientation of its feeds; x is taken to be {x}.")
 
 
-def _share_times(data: UVData, notes: list[str]) -> None:
-    """Undo averaging in time that differs between baselines."""
+def _require_ascending(frequencies: np.ndarray) -> None:
+    """Raise InputError if spectral windows, in the order of their frequencies, overlap."""
+    falls = np.flatnonzero(np.diff(frequencies) <= 0)
+    if falls.size:
+        end, start = frequencies[falls[0] : falls[0] + 2] / 1e6
+        raise InputError(
+            f"data: spectral windows overlap: one ends at {end:.3f} MHz, and the next starts at {start:.3f} MHz; "
+            "channels must ascend: select those of one window by --select frequencies"
+        )
+
+
+def share_times(data: UVData, notes: list[str]) -> None:
+    """Undo averaging in time that differs between baselines, of data or of metadata alone."""
     integration = np.asarray(data.integration_time)
     shortest = float(integration.min())
     if np.allclose(integration, shortest, rtol=0.01):

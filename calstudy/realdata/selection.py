@@ -39,7 +39,7 @@ class Selection:
 
     Attributes
     ----------
-    antennas : antenna numbers or names
+    antennas : antenna numbers or names, such as ``1``, ``number:1`` or ``name:1``
     lengths : baseline lengths in m
     times : indices of integrations, counted from zero
     frequencies : channel centres in Hz
@@ -157,18 +157,32 @@ def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: boo
     return chosen
 
 
-def _antenna(data: UVData, name: str) -> int:
-    numbers, names = data.telescope.antenna_numbers.tolist(), list(data.telescope.antenna_names)
+def antenna_text(data: UVData, number: int) -> str:
+    """Return how a selection says an antenna: its number, marked as such if that is the name of another one."""
+    return str(number) if _by_name(data).get(str(number), number) == number else f"number:{number}"
+
+
+def _by_name(data: UVData) -> dict[str, int]:
+    return dict(zip(data.telescope.antenna_names, data.telescope.antenna_numbers.tolist(), strict=True))
+
+
+def _antenna(data: UVData, text: str) -> int:
+    by_name = _by_name(data)
     present = set(data.ant_1_array.tolist()) | set(data.ant_2_array.tolist())
-    if name in names and name.isdecimal() and int(name) in present and numbers[names.index(name)] != int(name):
+    kind, colon, value = text.partition(":")
+    kind, name = (kind, value.strip()) if colon and kind in ("number", "name") else ("", text)
+    named = None if kind == "number" else by_name.get(name)
+    numbered = None if kind == "name" or not name.isdecimal() else int(name)
+    if named is not None and numbered in present and named != numbered:
+        other = next(other for other, number in by_name.items() if number == numbered)
         raise InputError(
-            f"--select antennas: {name!r} is the name of antenna {numbers[names.index(name)]} and the number of "
-            f"'{names[numbers.index(int(name))]}'; rename the antennas"
+            f"--select antennas: {name!r} is the name of antenna {named} and the number of '{other}'; write "
+            f"'name:{name}' or 'number:{name}'"
         )
-    number = numbers[names.index(name)] if name in names else int(name) if name.isdecimal() else None
+    number = numbered if named is None else named
     if number is None or number not in present:
         raise InputError(
-            f"--select antennas: {name!r} is not in the data, which have {', '.join(map(str, sorted(present)))}"
+            f"--select antennas: {text!r} is not in the data, which have {', '.join(map(str, sorted(present)))}"
         )
     return number
 

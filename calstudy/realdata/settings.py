@@ -110,7 +110,10 @@ FrequencyRange = Annotated[str, AfterValidator(lambda value: _require_selection(
 class Select(Section):
     """A part of the data, as `--select` of `calstudy calibrate` takes it; ranges include both ends."""
 
-    antennas: str | None = Field(None, description="Numbers or names: '0,1,12'.")
+    antennas: str | None = Field(
+        None,
+        description="Numbers or names: '0,1,12'; 'number:1' or 'name:1' where a name is the number of another antenna.",
+    )
     lengths: str | None = Field(None, description="Baseline lengths: '14 m..60 m'.")
     times: str | None = Field(None, description="Integrations, counted from 0: '0..9'.")
     frequencies: str | None = Field(None, description="Channel centres: '120 MHz..180 MHz'.")
@@ -138,7 +141,7 @@ class Factor(Section):
 class FromAutocorrelations(SystemTemperature):
     """The median autocorrelation is that of the system temperature: receiver + sky (nu / sky_frequency)^sky_index.
 
-    In Jy it is k_B T / A_e with A_e = wavelength^2 over the solid angle of `observed.beam`. One number for all data.
+    In Jy it is k_B T / A_e with A_e = wavelength^2 over the solid angle of `observed.beam`. One number for each half.
     """
 
     kind: Literal["system-temperature"]

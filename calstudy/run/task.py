@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -171,13 +171,13 @@ def _each(name: str, kind: str, value: Any, change: Callable[[str, Any], Any]) -
     return change(name, value)
 
 
-def unique(tasks: Iterable[Task]) -> list[Task]:
-    """Return tasks and all that they need, once each, every task after its inputs."""
+def unique(tasks: Iterable[Task], given: Container[str] = ()) -> list[Task]:
+    """Return tasks and all that they need, once each, every task after its inputs; those in `given` need nothing."""
     found: dict[str, Task] = {}
 
     def visit(task: Task) -> None:
         if task.key not in found:
-            for needed in task.needs.values():
+            for needed in () if task.key in given else task.needs.values():
                 visit(needed)
             found[task.key] = task
 

@@ -22,6 +22,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
 from calstudy.base.gains import closest_solutions, gain_products, solutions
 from calstudy.base.observation import Frame, Observation
+from calstudy.base.paths import leaves
 from calstudy.base.plugins import guarded
 from calstudy.base.schema import Section, fault
 from calstudy.base.visibilities import antenna_pairs, flag_cube
@@ -329,7 +330,8 @@ class DataCalibration(DataStudy):
         if not (folder / SOLUTION).exists():
             return
         section = self.file.observed
-        read = {Path(path).resolve() for path in (*section.data, section.sky_model, self.start) if path is not None}
+        named = (value for _, value in leaves(self.file.calibration.model_dump()) if isinstance(value, Path))
+        read = {path.resolve() for path in (*section.data, section.sky_model, *named) if path is not None}
         for path in (folder / name for name in results_in(folder)):
             if path.name not in written and path.resolve() not in read:
                 path.unlink()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from string import Template
@@ -20,7 +22,15 @@ from calstudy.base.files import sha256
 from calstudy.base.gain_files import CASACORE
 from calstudy.base.paths import leaves
 from calstudy.base.visibilities import flag_cube, from_cube, to_cube
-from calstudy.calibrate.calibrators.given_gains import MANIFEST, DataSet, Manifest, salted
+from calstudy.calibrate.calibrators.given_gains import (
+    GAINS_SUFFIXES,
+    MANIFEST,
+    MODEL_SUFFIXES,
+    DataSet,
+    Manifest,
+    read_manifest,
+    salted,
+)
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
 from calstudy.experiment.model import Experiment
@@ -40,6 +50,9 @@ if TYPE_CHECKING:
 FORMATS = ("uvh5", "uvfits", "ms")
 README, LOG = "README.md", "export.log"
 SKY_MODEL = "sky-model"
+OWN = re.compile(rf"(data-\d+|{SKY_MODEL})\.({'|'.join(FORMATS)})")
+"""Names of data and sky models that an export writes."""
+RETURNED = (*GAINS_SUFFIXES, *MODEL_SUFFIXES)
 CARRIER = {"none": "none"}
 """Calibrator of exported worlds, on which data and assumptions do not depend."""
 TEXT = Path(__file__).with_suffix(".md")
@@ -71,24 +84,64 @@ def export(
 def folders_of(worlds: Comparison, folder: Path, file_format: str, overwrite: bool) -> list[Path]:
     """Return the folder of each world; parameters as for `export`.
 
-    Raises InputError if there is no such format, files would be replaced without `overwrite`, or cannot be written.
+    Raises InputError if there is no such format, files would be replaced without `overwrite`, or cannot be written, or
+    gains would be taken for those of other data.
     """
     if file_format not in FORMATS:
         raise InputError(f"--format {file_format}: not a format of visibilities (allowed: {', '.join(FORMATS)})")
     if file_format == "ms" and find_spec("casacore") is None:
         raise InputError(f"--format ms: takes {CASACORE}")
     several = len(worlds.cases) > 1
+    if several and (folder / MANIFEST).exists():
+        raise InputError(
+            f"--output {folder}: has the {MANIFEST} of a single world, and those of {len(worlds.cases)} worlds would "
+            "not be found below it; use another folder"
+        )
     folders = [folder / f"world-{place + 1}" if several else folder for place in range(len(worlds.cases))]
-    for place in folders:
+    for case, place in zip(worlds.cases, folders, strict=True):
         require_writable(place, f"--output {place}")
         if not overwrite and place.is_dir() and any(place.iterdir()):
             raise InputError(f"--output {place}: holds files already; use --overwrite or another folder")
+        _require_none_returned(WorldData.of(case.experiment, worlds.file.salt).digest, place)
     return folders
+
+
+def _require_none_returned(digest: str, folder: Path) -> None:
+    """Raise InputError if a folder has gains or models that were found for data of another digest."""
+    found = [path.name for suffix in RETURNED for path in sorted(folder.glob(f"data-*{suffix}"))]
+    earlier = _earlier(folder)
+    if found and (earlier is None or earlier.digest != digest):
+        raise InputError(
+            f"--output {folder}: holds what was returned for other data, {', '.join(found)}; move these files away, or "
+            "use another folder"
+        )
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove the data and the sky model of an earlier export, whose names end otherwise in other formats."""
+    if (earlier := _earlier(folder)) is not None:
+        for name in (*(item.file for item in earlier.data), earlier.sky_model):
+            if name is not None and OWN.fullmatch(name):
+                _remove(folder / name)
+
+
+def _earlier(folder: Path) -> Manifest | None:
+    """Return the manifest of an earlier export, or None if there is none that can be read."""
+    with suppress(InputError):
+        return read_manifest(folder / MANIFEST)
+    return None
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
 
 
 def _write_world(content: WorldData, products: Mapping[str, Product], folder: Path, file_format: str) -> None:
     from calstudy.instrument.telescope import make_template
 
+    _remove_earlier(folder)
     template = make_template(assumed_world(content.experiment).instrument, as_built=True)
     # A layout may be named after a file.
     template.telescope.name = template.telescope.instrument = "calstudy"
@@ -124,9 +177,7 @@ def _at(template: UVData, uvd: UVData) -> UVData:
 
 def _write(uvd: UVData, path: Path, single: bool) -> None:
     """Write visibilities in the format of the path's suffix; `single` stores complex64, as uvfits and ms always do."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
+    _remove(path)
     if path.suffix == ".uvh5":
         write_visibilities(uvd, path, single)
         return
@@ -139,6 +190,11 @@ def _write(uvd: UVData, path: Path, single: bool) -> None:
 
 def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
     names = [item.name for item in manifest.data]
+    conjugates = (
+        f" Visibilities are meant as pyuvdata reads them: {file_format} files hold their complex conjugates, so that "
+        "gains found from the columns of the files must be conjugated in CalH5 or calfits files, but not in those of "
+        "DP3, hyperdrive and calibrate."
+    )
     rows = [f"| `{item.file}` | data to be calibrated, with flags |" for item in manifest.data]
     phased = f"Data are phased to the zenith of the first integration, as {file_format} wants them."
     if manifest.sky_model is not None:
@@ -160,6 +216,7 @@ def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
         default="the gains cannot be scored, for nothing is assumed of the sky"
         if manifest.sky_model is None
         else f"`{manifest.sky_model}` is subtracted from the calibrated data",
+        conjugates="" if file_format == "uvh5" else conjugates,
         phase="The telescope drifts: data are not phased." if file_format == "uvh5" else phased,
         noise="The data have no noise."
         if manifest.noise is None

@@ -49,20 +49,9 @@ def require_possible(experiment: Experiment) -> None:
 
 
 def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
-    """Raise InputError if a table or a box cannot be used for a band, or maps lack what long baselines see.
-
-    Maps of a spectrum that is not flat end at l = 3 nside - 1. Beyond it baselines see replicas of what is below, with
-    a sixth to all of the power of the spectrum.
-    """
+    """Raise InputError if a table or a box cannot be used for a band, or maps lack what long baselines see."""
     band = instrument.channels.band
-    longest = frame_of(instrument).lengths.max(initial=0.0)
-    seen = 2 * math.pi * (longest + APERTURE) * band[1] / SPEED_OF_LIGHT
-    if eor.spectrum != "flat" and seen > 3 * eor.nside - 1:
-        enough = 2 ** math.ceil(math.log2((seen + 1) / 3))
-        raise InputError(
-            f"sky.eor.nside = {eor.nside}: maps of a {eor.spectrum} spectrum have multipoles up to {3 * eor.nside - 1} "
-            f"and baselines of {longest:.0f} m see multipoles up to {seen:.0f}; give at least {enough}"
-        )
+    require_fine_maps(eor, frame_of(instrument).lengths, band, "sky.eor")
     if eor.path is None:
         return
     if eor.spectrum == "box":
@@ -73,6 +62,24 @@ def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
         from calstudy.sky.eor import read_power_table
 
         read_power_table(eor.path)
+
+
+def require_fine_maps(eor: Eor, lengths: np.ndarray, band: tuple[float, float], field: str) -> None:
+    """Raise InputError if maps of an EoR lack what the longest baseline sees; baseline `lengths` are in m.
+
+    Maps of a spectrum that is not flat end at l = 3 nside - 1. Beyond it baselines see replicas of what is below, with
+    a sixth to all of the power of the spectrum. `field` is the name of the EoR's section.
+    """
+    if eor.spectrum == "flat" or not lengths.size:
+        return
+    longest, most = lengths.max(), 3 * eor.nside - 1
+    seen = 2 * math.pi * (longest + APERTURE) * band[1] / SPEED_OF_LIGHT
+    if seen > most:
+        enough = 2 ** math.ceil(math.log2((seen + 1) / 3))
+        raise InputError(
+            f"{field}.nside = {eor.nside}: maps of a {eor.spectrum} spectrum have multipoles up to {most}, and "
+            f"baselines of {longest:.0f} m see multipoles up to {seen:.0f}; give at least {enough}, or spectrum: flat"
+        )
 
 
 def require_beams(instrument: InstrumentSettings) -> None:

@@ -171,10 +171,10 @@ def _require_label(label: str) -> None:
 
 def tables(scores: Scores) -> dict[str, Table]:
     """Return a table for each world, as in the comparison of calibrators, and one of which calibrators pass."""
-    worlds = dict.fromkeys(row.world for row in scores.rows)
+    worlds = dict.fromkeys([*(row.world for row in scores.rows), *(world for world, _, _ in scores.refusals)])
     found = {world: {row.calibrator: row.scores for row in scores.rows if row.world == world} for world in worlds}
     trusted = standing_table(standings(found, scores.refusals))
-    return {**{world: score_table(cases) for world, cases in found.items()}, trusted.title: trusted}
+    return {**{world: score_table(cases) for world, cases in found.items() if cases}, trusted.title: trusted}
 
 
 def read_scores(path: Path) -> Scores:

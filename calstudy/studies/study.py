@@ -217,8 +217,8 @@ class Study(ABC):
 
     @cached_property
     def tasks(self) -> list[Task]:
-        """All tasks, once each, every one after its inputs."""
-        return unique(self.targets)
+        """All tasks, once each, every one after its inputs, but none that only `external_keys` need."""
+        return unique(self.targets, self.external_keys)
 
     @property
     def recorded(self) -> Sequence[Task]:
@@ -261,7 +261,7 @@ class Study(ABC):
             "captions": {task.label: task.settings["figure"].captioned() for task in self.figures},
             **({"parts": places} if places else {}),
             **self.entries,
-            "warnings": removed(self.recorded, made.products),
+            "warnings": removed((task for task in self.recorded if task.key not in self.external_keys), made.products),
             "products": product_entries(
                 self.recorded, made.products, made.tasks, self.tables if self.keeps_tables else ()
             ),

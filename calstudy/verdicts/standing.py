@@ -158,9 +158,9 @@ class InBand:
 
     @property
     def decisive(self) -> list[InWorld]:
-        """The worlds with the worst standing, those with the largest bias first."""
+        """The worlds with the worst standing: refused ones first, then unknown biases, then from the largest bias."""
         found = [world for world in self.worlds if world.standing(self.limit) == self.standing]
-        return sorted(found, key=lambda world: (not world.refused, -abs(world.bias)))
+        return sorted(found, key=lambda world: (not world.refused, not math.isnan(world.bias), -abs(world.bias)))
 
     @property
     def upper_limit(self) -> float:

@@ -23,10 +23,11 @@ from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import make_uvcal
 from calstudy.calibrate.expected_loss import ExpectedTransfer
 from calstudy.cli import main as cli
+from calstudy.cli.calibrate import _calibration
 from calstudy.interface import CalibratedData
 from calstudy.power.tables import load_spectrum
 from calstudy.realdata.settings import defaults
-from calstudy.studies.calibration import FIGURE_FILES, IN_USE
+from calstudy.studies.calibration import FIGURE_FILES, IN_USE, DataCalibration, calibration_file
 
 WRITTEN = {"gains.calh5", "model.uvh5", "residual.uvh5", "solution.json", *FIGURE_FILES}
 """Without options."""
@@ -219,6 +220,23 @@ def test_results_that_are_replaced_leave_none_of_the_earlier_calibration(command
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt", "gains.calfits"}
     assert command(data, *OPTIONS, *one, "--output", "out", "--overwrite")[0] == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == WRITTEN | {"notes.txt"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "kept"),
+    [
+        ({"calibrator": "by-file", "gains": "gains.h5", "model": "model.uvh5"}, {"gains.h5", "model.uvh5"}),
+        ({"weights": {"kind": "file", "path": "gains.fits"}}, {"gains.fits"}),
+        ({"initial_gains": {"kind": "file", "path": "gains.h5"}}, {"gains.h5"}),
+    ],
+)
+def test_files_that_a_calibration_reads_are_not_removed(data, monkeypatch, tmp_path, settings, kept):
+    monkeypatch.chdir(tmp_path)
+    for name in ("gains.h5", "gains.fits", "model.uvh5", "residual.uvh5", "solution.json"):
+        (tmp_path / name).touch()
+    sections = {"observed": {"data": [str(data)]}, "calibration": settings}
+    DataCalibration.load(calibration_file(sections, tmp_path))._remove_earlier(tmp_path, {"solution.json"})
+    assert {path.name for path in tmp_path.iterdir()} == {"data.uvh5", "solution.json", *kept}
 
 
 def test_two_calibrations_do_not_write_to_one_folder(command, data, tmp_path):
@@ -467,3 +485,12 @@ def test_the_loss_of_smoothed_gains_is_not_expected(command, data):
     code, told = command(data, *OPTIONS, *smooth, "--expected-loss", "--dry-run")
     assert code == 2
     assert "--expected-loss: lacks the effect of calibration.smooth_gains on the residual" in told
+
+
+def test_an_empty_section_of_a_settings_file_changes_nothing_and_a_list_is_refused(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("calibration:\n")
+    assert _calibration(path, {"solver": "adamax"}) == {"solver": "adamax"}
+    path.write_text("calibration: [calamity]")
+    with pytest.raises(InputError, match=r"settings.yaml: calibration = \['calamity'\]: must be the name of a"):
+        _calibration(path, {})

@@ -45,6 +45,15 @@ def test_a_phase_for_every_channel_and_a_scale_do_not_count(template, gains):
     assert max(found.of_antenna.max(), found.of_channel.max(), found.of_delay.max()) < 1e-12
 
 
+def test_feeds_of_the_same_direction_are_compared(gains):
+    east = make_uvdata(make_toy(scattered(N_ANTENNAS)), 2, (-5, -6))
+    north = east.copy()
+    north.telescope.set_feeds_from_x_orientation("north", feeds=["x", "y"])
+    both = np.concatenate([gains, gains.conj()], axis=3)
+    pair = pair_gains(make_uvcal(east, both), make_uvcal(north, both[..., ::-1]))
+    assert np.array_equal(pair.first, pair.second)
+
+
 def test_amplitudes_and_gradients_count_unless_the_array_is_redundant(template, gains):
     rng = np.random.default_rng(3)
     positions = template.telescope.get_enu_antpos()[:, :2]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
-from pyuvdata import UVCal
+from pyuvdata import UVCal, UVData
 from toy import complex_normal, make_toy, scattered
 from toy_data import make_uvdata
 
@@ -25,6 +25,7 @@ from calstudy.calibrate.calibrators.given_gains import ByFile
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import starting_gains
 from calstudy.corrupt.effects.gains import FileGains
+from calstudy.realdata.halves import east_and_north
 
 N_ANTENNAS, N_TIMES, N_SOLUTIONS = 5, 4, 2
 FORMATS = ("gains.bin", "gains.fits", "gains.h5")
@@ -169,6 +170,38 @@ def test_solutions_hold_in_their_times(world, tmp_path, name):
     later.set_lsts_from_time_array()
     with pytest.raises(InputError, match="no solution within half an integration"):
         by_file(tmp_path / name, later, from_cube(later, to_cube(sky)))
+
+
+def write_calh5(path, of_file, uvd):
+    make_uvcal(uvd, of_file.conj()).write_calh5(str(path))
+
+
+def write_casa(path, of_file, uvd):
+    """Write a table, which does not tell where its feeds point."""
+    pytest.importorskip("casacore", reason="the extra [ms] is not installed")
+    make_uvcal(uvd, of_file.conj()).write_ms_cal(str(path))
+
+
+@pytest.mark.parametrize("name", [*FORMATS, "gains.calh5", "gains.cal"])
+@pytest.mark.parametrize("turned", [True, False])
+def test_gains_and_models_are_of_the_feeds_that_they_were_found_for(world, tmp_path, name, turned):
+    """Where files call the northern feed x, and where measured data were renamed since."""
+    north, sky, gains = (made.copy() for made in world)
+    of_run = gains[:, :, :1]
+    for uvd in (north, sky):
+        uvd.telescope.set_feeds_from_x_orientation("north", feeds=["x", "y"])
+    data = from_cube(north, corrupted(north, to_cube(sky), of_run))
+    writers = {**WRITERS, "gains.calh5": write_calh5, "gains.cal": write_casa}
+    writers[name](tmp_path / name, of_run.conj(), data)
+    sky.write_uvh5(tmp_path / "model.uvh5")
+    if turned:
+        assert east_and_north(data) != []
+        # As a product.
+        data.write_uvh5(tmp_path / "data.uvh5")
+        data = UVData.from_file(tmp_path / "data.uvh5")
+    result = run_calibrator(ByFile(gains=tmp_path / name, model=tmp_path / "model.uvh5"), data)
+    # CASA stores complex64.
+    assert np.abs(to_cube(result.residual)).max() < 1e-6 * np.abs(to_cube(sky)).max()
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -10,11 +10,13 @@ from toy import make_toy, scattered
 from toy_data import make_uvdata
 
 from calstudy.base.errors import InputError
+from calstudy.base.gains import make_uvcal
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cube, require_rectangular, to_cube
 from calstudy.calibrate.sky_model import match_sky_model
 from calstudy.instrument.telescope import make_template
+from calstudy.realdata.halves import read_facts
 from calstudy.realdata.reading import prepare, read_visibilities
-from calstudy.realdata.selection import Selection, parse_values, select, split_selections
+from calstudy.realdata.selection import Selection, antenna_text, parse_values, select, split_selections
 
 
 @pytest.fixture
@@ -98,6 +100,22 @@ def test_data_without_common_times_are_refused(data):
         prepare(data.select(blt_inds=keep, inplace=False))
 
 
+@pytest.mark.parametrize("times", [None, (0, 1), (1, 2)])
+def test_a_plan_has_the_times_of_data_whose_averaging_differs(toy, tmp_path, times):
+    """As they are once all baselines have the shortest integrations; also those of no sample before."""
+    data = make_uvdata(toy, 4)
+    short = data.ant_1_array == 10
+    whole, averaged = (data.select(blt_inds=np.flatnonzero(chosen), inplace=False) for chosen in (short, ~short))
+    averaged.downsample_in_time(n_times_to_avg=2, allow_drift=True)
+    (whole + averaged).write_uvh5(str(tmp_path / "data.uvh5"))
+    path, selection = tmp_path / "data.uvh5", Selection(times=times)
+    facts = read_facts((path,), selection)
+    prepared, _ = prepare(read_visibilities([path]), selection)
+    assert np.array_equal(facts.times, np.unique(prepared.time_array))
+    assert np.array_equal(facts.frame.pairs, antenna_pairs(prepared))
+    assert facts.integration == prepared.integration_time[0]
+
+
 def test_cross_hands_are_left_out_and_told(toy):
     both = make_uvdata(toy, 1, polarizations=(-5, -6))
     crossed = both.copy()
@@ -137,6 +155,38 @@ def test_sky_models_are_matched_and_turned(data):
             prepare(sky, Selection(antennas=("10", "12", "14", "16")))[0],
             prepare(data, Selection(antennas=("10", "12", "14", "16", "18")))[0],
         )
+
+
+def test_sky_models_of_descending_channels_are_matched(data):
+    sky = data.copy()
+    sky.reorder_freqs(channel_order="-freq")
+    assert np.array_equal(match_sky_model(sky, data).data_array, data.data_array)
+
+
+def windows(data, starts, length):
+    """Return data of spectral windows that start at these channels, in this order."""
+    channels = np.concatenate([np.arange(start, start + length) for start in starts])
+    made = data.copy()
+    for name in ("freq_array", "channel_width"):
+        setattr(made, name, getattr(data, name)[channels])
+    for name in ("data_array", "flag_array", "nsample_array"):
+        setattr(made, name, getattr(data, name)[:, channels])
+    made.Nfreqs, made.Nspws, made.spw_array = channels.size, len(starts), np.arange(len(starts))
+    made.flex_spw_id_array = np.repeat(made.spw_array, length)
+    made.check()
+    return made
+
+
+def test_channels_of_windows_in_any_order_ascend(data):
+    prepared, _ = prepare(windows(data, (32, 0, 48), 16))
+    kept = data.select(freq_chans=[*range(16), *range(32, 64)], inplace=False)
+    assert np.array_equal(prepared.freq_array, kept.freq_array)
+    assert np.array_equal(prepared.data_array, kept.data_array)
+    prepared.check()
+    gains = make_uvcal(prepared, np.ones((prepared.telescope.Nants, 48, 3, 1), complex))
+    assert np.array_equal(gains.freq_array, kept.freq_array)
+    with pytest.raises(InputError, match=r"spectral windows overlap: one ends at 169.600 MHz, and the next starts at"):
+        prepare(windows(data, (0, 20), 25))
 
 
 def selected(texts):
@@ -215,5 +265,18 @@ def test_a_name_that_is_the_number_of_another_antenna_is_refused(data):
     swapped = data.copy()
     names = swapped.telescope.antenna_names
     names[0], names[1] = str(swapped.telescope.antenna_numbers[1]), str(swapped.telescope.antenna_numbers[0])
-    with pytest.raises(InputError, match=r"'10' is the name of antenna 12 and the number of '12'; rename"):
+    with pytest.raises(InputError, match=r"antenna 12 and the number of '12'; write 'name:10' or 'number:10'"):
         prepare(swapped, Selection(antennas=("10", "14", "16")))
+
+
+def test_numbers_and_names_of_antennas_are_told_apart(data):
+    swapped = data.copy()
+    names = swapped.telescope.antenna_names
+    names[0], names[1] = "12", "10"
+    assert [antenna_text(swapped, number) for number in (10, 12, 14)] == ["number:10", "number:12", "14"]
+    for texts, numbers in ((("number:10", "14"), {10, 14}), (("name:10", "ant14"), {12, 14})):
+        part = select(swapped, Selection(antennas=texts))
+        assert set(antenna_pairs(part).ravel().tolist()) == numbers
+    for text in ("number:7", "name:14", "number:ant14"):
+        with pytest.raises(InputError, match=f"'{text}' is not in the data, which have 10, 12"):
+            select(swapped, Selection(antennas=(text,)))

@@ -167,6 +167,29 @@ def test_weights_of_a_file_are_found_by_baseline_and_time(toy, tmp_path):
         make_weights(Observation(data), everything(data), FileWeights(kind="file", path=tmp_path / "x.h5"))
 
 
+def test_weights_of_a_file_are_needed_for_samples_with_data(toy, tmp_path):
+    """Those of a file whose rows are those of the measurement, where a baseline lacks an integration."""
+    data = make_uvdata(toy, 2)
+    part = data.select(blt_inds=np.delete(np.arange(data.Nblts), 5), inplace=False)
+    settings = uvflag(part, np.ones(part.data_array.shape), tmp_path / "w.h5")
+    with pytest.raises(InputError, match="no weights for some baselines or integrations"):
+        make_weights(Observation(data), everything(data), settings)
+    data.flag_array[5] = True
+    weights = make_weights(Observation(data), everything(data), settings)
+    assert np.array_equal(weights > 0, ~Observation(data).flags)
+
+
+def test_weights_of_a_file_are_those_of_feeds_of_the_same_direction(toy, tmp_path):
+    data = make_uvdata(toy, 1, (-5, -6))
+    north = data.copy()
+    north.telescope.set_feeds_from_x_orientation("north", feeds=["x", "y"])
+    values = np.random.default_rng(5).uniform(0.5, 2, data.data_array.shape)
+    settings = uvflag(north, values, tmp_path / "w.h5")
+    weights = make_weights(Observation(data), everything(data), settings)
+    ratios = weights / values[None, :, :, ::-1]
+    assert np.allclose(ratios, ratios[:, :1, :1], rtol=1e-10)
+
+
 def test_complex_weights_are_refused(toy, tmp_path, monkeypatch):
     data = make_uvdata(toy, 1)
     settings = uvflag(data, np.ones(data.data_array.shape), tmp_path / "w.h5")

@@ -9,11 +9,19 @@ from paper_runs import ADAMAX, AUTHORS, EXPERIMENTS, LOW_SNR_FACTS, PAPER, run_f
 from tiny import of_the_paper
 
 from calstudy.base.errors import InputError
-from calstudy.claims.bins import RecoveredPower, bias_extent, difference_of_ratios, fraction_within, recovered
+from calstudy.claims.bins import (
+    RecoveredPower,
+    bias_extent,
+    difference_of_losses,
+    difference_of_ratios,
+    fraction_within,
+    recovered,
+)
 from calstudy.claims.evaluation import evaluate_folder, evaluate_members, evaluate_run, refusals_of_run
 from calstudy.experiment.files import override, validate
 from calstudy.power.tables import save_spectrum
 from calstudy.studies.load import load_study
+from calstudy.verdicts.statement import Unevaluated
 from calstudy.verdicts.tables import from_json
 
 GROUPS = {"calibration": {"calibrator": "calamity-redundant"}}
@@ -634,3 +642,11 @@ def test_a_collection_without_its_members_says_where_its_verdicts_are(make_study
     with pytest.raises(InputError, match=r"not beside it \(.*redundant-0123abcd\); .*verdicts are in .*claims\.md"):
         evaluate_folder(folder)
     assert (folder / "claims.json").read_text() == "[]"
+
+
+def test_losses_in_different_bins_are_not_compared(make_study):
+    one, other = make_study("one"), make_study("other")
+    found = one.transfer("outside-wedge")
+    save_spectrum(other.folders[0] / "transfer.outside-wedge.h5", replace(found, bin_edges=2 * found.bin_edges))
+    with pytest.raises(Unevaluated, match="different bins of k"):
+        difference_of_losses(one, other, 0.2)

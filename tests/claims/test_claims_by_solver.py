@@ -79,8 +79,11 @@ def test_the_folder_of_a_collection_gets_the_table_and_a_single_run_does_not(stu
     assert not any("run-time" in name or "step" in name for name in found)
     assert "Stand-in: a small sky." in (folder / "claims-by-solver.md").read_text()
     alone = runs / "minimal-adamax-1"
+    # Those of an earlier evaluation do not stay.
+    for name in CLAIMS_FILES:
+        (alone / name).write_text("earlier")
     evaluate_folder(alone)
-    assert not (alone / "claims-by-solver.json").exists()
+    assert {path.name for path in alone.glob("claims*")} == {"claims.json", "claims.md"}
 
 
 def as_collection(studies, output):

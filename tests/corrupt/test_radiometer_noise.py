@@ -117,22 +117,24 @@ def test_the_theory_of_the_noise_power_takes_a_spectrum_of_noise():
     assert noise_power(instrument, power, rising) == pytest.approx(noise_power(instrument, power, flat), rel=1e-3)
 
 
-def test_autocorrelations_of_a_run_say_what_the_noise_of_its_baselines_is(tmp_path):
+@pytest.mark.parametrize(("noise", "nights"), [({}, 1), ({"kind": "radiometer", "nights": 100}, 100)])
+def test_autocorrelations_of_a_run_say_what_the_noise_of_its_baselines_is(noise, nights, tmp_path):
     """The radiometer equation, from autocorrelations after the gains, gives the variance |g_a g_b|^2 sigma^2."""
     noisy = Variant(components=("noise",), effects=True)
-    graph = Graph(validate(override(tiny(tmp_path), "calibration.weights", "autos"), tmp_path))
+    settings = override(tiny(tmp_path), "calibration.weights", "autos")
+    graph = Graph(validate(override(settings, "corruption.noise", noise) if noise else settings, tmp_path))
     tasks = corruption.data(graph, noisy, "even"), corruption.autocorrelations(graph, noisy, "even")
     levels, true = corruption.levels(graph), corruption.gains(graph)
     products = make([*tasks, levels, true], tmp_path)
     data, autos = (read_visibilities(products[task.key].path / "data.uvh5") for task in tasks)
     joined = with_autocorrelations(data, autos)
     pairs = antenna_pairs(data)
-    sigma = Levels(**read_json(products[levels.key].path / "levels.json")).noise_std
+    sigma = np.ravel(Levels(**read_json(products[levels.key].path / "levels.json")).noise)
     gains = read_gains(products[true.key].path / "gains.calh5", "test").gain_array[:, :, 0, 0]
     expected = (sigma * np.abs(gains[pairs[:, 0]] * gains[pairs[:, 1]])) ** 2
     found = radiometer_variance(joined, pairs, 0)
-    # Noise of 1 / sqrt(400 kHz x 10 s) = 0.05 % in each autocorrelation.
-    assert np.std(found / expected) == pytest.approx(np.sqrt(2 / 4e6), rel=0.1)
+    # Noise of 1 / sqrt(400 kHz x 10 s) = 0.05 % in each autocorrelation of a night.
+    assert np.std(found / expected) == pytest.approx(np.sqrt(2 / 4e6 / nights), rel=0.1)
     assert np.mean(found / expected) == pytest.approx(1, abs=1e-4)
     # 1344 samples: their mean square is known to 1 / sqrt(1344) = 2.7 %.
     ratio = np.abs(to_cube(joined)[:, : len(pairs), :, 0]) ** 2 / found

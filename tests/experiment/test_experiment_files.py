@@ -10,6 +10,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.files import (
     apply_scale,
     dump,
+    dump_yaml,
     override,
     parse_override,
     parse_yaml,
@@ -182,6 +183,14 @@ def test_override_values_are_yaml():
     assert parse_override("a=80 kHz") == ("a", "80 kHz")
     with pytest.raises(InputError, match="write a dotted path and a value"):
         parse_override("a.b")
+
+
+@pytest.mark.parametrize("in_line", [False, True])
+def test_texts_that_look_like_numbers_stay_texts(in_line):
+    content = {"1e5": ["1e-3", "+2E5", "1.5e3", "010", "6:24", "1e-3 m", 1e-3, 1e300]}
+    assert parse_yaml(dump_yaml(content, in_line), "text") == content
+    experiment = Experiment(name="1e5", description="1e-3")
+    assert validate(parse_yaml(dump(experiment), "text"), HERE) == experiment
 
 
 @pytest.mark.parametrize(

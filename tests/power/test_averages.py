@@ -428,12 +428,15 @@ def test_equal_lengths_share_a_bin_of_the_wedge(observe, white, beam):
     np.testing.assert_allclose(expected.length_edges, wedge.bin_edges)
 
 
-def test_redundant_baselines_without_shares_are_not_matched(observe, white, beam):
+def test_redundant_baselines_without_shares_are_not_matched(observe, white, beam, caplog):
     settings, template = PowerSettings(pairs="same-baseline"), observe(HexLayout(kind="hex", side=2), n_channels=16)
     data = white(template, np.random.default_rng(3))
     whole = delay_spectra(estimate_power(data, data, beam, settings), settings)
     part = whole.of_units(np.arange(2, 12))
     assert of_common_units({"eor": whole, "residual": part})["eor"].power.tolist() == part.power.tolist()
+    assert "averages of different numbers" not in caplog.text
+    of_common_units({"eor": dataclasses.replace(whole, n_times=3), "residual": whole})
+    assert "of times and polarizations (eor 3 and 1, residual 1 and 1), because some were not calibrated" in caplog.text
     empty = {name: np.zeros(0, int) for name in ("share_unit", "share_antenna", "share_pairs")}
     whole, part = (dataclasses.replace(one, **empty) for one in (whole, part))
     assert of_common_units({"eor": whole, "residual": whole})["eor"] is whole

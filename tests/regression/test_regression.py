@@ -30,6 +30,7 @@ from calstudy.regression import (
     rules_of,
     show,
 )
+from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study
@@ -325,3 +326,17 @@ def test_the_published_references_can_be_read_and_made_again(name):
     assert study.name == name
     compared = compare_figures(results.figures, results.figures, results.tolerances)
     assert {item.status for item in compared} == {"same"}
+
+
+def test_default_figures_of_measured_data_have_their_tolerances(tmp_path):
+    (tmp_path / "experiment.yaml").write_text("{name: mine, observed: {data: [a.uvh5]}, outputs: {figures: null}}")
+    assert rules_of("observed-wedge", read_reference(tmp_path).tolerances)
+
+
+def test_texts_that_look_like_numbers_stay_texts_in_a_reference(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "manifest.json").write_text('{"name": "mine"}')
+    (run / "experiment.yaml").write_text("{name: mine, description: '1e-3'}")
+    accept(run, tmp_path / "kept")
+    assert RunFolder(tmp_path / "kept").content["description"] == "1e-3"

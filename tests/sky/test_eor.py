@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.power.cosmology import input_power
 from calstudy.sky.eor import HYDROGEN_LINE, EorField, comoving_geometry
 from calstudy.sky.settings import Eor
+from calstudy.studies.preflight import APERTURE, require_fine_maps
 
 CHANNELS = 167.075e6 + 80e3 * np.arange(384)
 FEW = CHANNELS[:24]
@@ -217,3 +219,34 @@ def test_a_table_that_is_no_power_spectrum_is_refused(text, problem, tmp_path):
 def test_a_table_and_its_path_belong_together(fields):
     with pytest.raises(ValueError, match="is needed with spectrum: table"):
         Eor.model_validate(fields)
+
+
+def power_of_baselines(eor: Eor, length: float) -> float:
+    """Return the power of the visibilities of baselines of a length, m, over that of the input.
+
+    The beam is a Gaussian of the width of an MWA tile's; baselines have ten directions, and maps 24 channels.
+    """
+    field = EorField(eor, FEW)
+    directions = np.array(healpy.pix2vec(eor.nside, np.arange(field.n_pixels)))
+    up = directions[2] > 0
+    beam = np.exp(-(np.arccos(directions[2, up]) ** 2) / (2 * 0.17**2))
+    angles = np.pi * np.arange(10) / 10
+    turns = length * FEW.mean() / SPEED_OF_LIGHT * np.stack([np.cos(angles), np.sin(angles)], 1) @ directions[:2, up]
+    pixel = 4 * np.pi / field.n_pixels
+    visibilities = (np.exp(2j * np.pi * turns) * beam * pixel) @ field.maps(slice(None))[:, up].T
+    density = eor.amplitude / (field.distance**2 * field.depth) * np.sum(beam**2) * pixel
+    return float(np.mean(np.abs(visibilities) ** 2 / density))
+
+
+def test_maps_that_are_fine_enough_have_the_power_of_the_input_and_others_have_not():
+    """A P(k) of index 0 is as flat as the flat one, whose pixels are white, but its maps end at l = 3 nside - 1."""
+    law = [Eor(spectrum="power-law", index=0.0, nside=16, seed=seed) for seed in range(6)]
+    limit = 47 * SPEED_OF_LIGHT / (2 * np.pi * FEW.max()) - APERTURE
+    require_fine_maps(law[0], np.array([0.99 * limit]), (FEW.min(), FEW.max()), "sky.eor")
+    with pytest.raises(InputError, match=r"sky.eor.nside = 16: .* see multipoles up to 48; give at least 32"):
+        require_fine_maps(law[0], np.array([1.02 * limit]), (FEW.min(), FEW.max()), "sky.eor")
+    require_fine_maps(Eor(nside=16), np.array([1e3]), (FEW.min(), FEW.max()), "sky.eor")
+    # 144 maps, of which a baseline sees one mode each; its ten directions are nearly independent.
+    allowed = 4 / np.sqrt(144)
+    assert np.mean([power_of_baselines(eor, 0.99 * limit) for eor in law]) == pytest.approx(1, abs=allowed)
+    assert np.mean([power_of_baselines(eor, 2.2 * limit) for eor in law]) < 0.6

@@ -18,7 +18,14 @@ from tiny import load
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
-from calstudy.calibrate.calibrators.given_gains import MANIFEST, ByFile, find_returned, read_manifest
+from calstudy.calibrate.calibrators.given_gains import (
+    MANIFEST,
+    ByFile,
+    DataSet,
+    Manifest,
+    find_returned,
+    read_manifest,
+)
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import assumed_world
@@ -26,7 +33,7 @@ from calstudy.instrument.telescope import make_template
 from calstudy.products import corruption
 from calstudy.products.graph import Graph
 from calstudy.products.score import score
-from calstudy.studies.export import CARRIER
+from calstudy.studies.export import CARRIER, folders_of
 from calstudy.studies.kinds.comparison import WorldData, load_worlds
 from calstudy.studies.load import load_study
 from calstudy.studies.scores import Scores, leaderboard, read_scores, scoring_of
@@ -302,6 +309,44 @@ def test_faults_of_folders_are_sentences(skycal, home, tmp_path, capsys):
         load(home / "secret.yaml", overrides=['calibration={"calibrator": "by-file", "folder": "nowhere"}'])
     with pytest.raises(ExperimentError, match="needs either a folder, or gains for all data"):
         load(home / "secret.yaml", overrides=["calibration=by-file"])
+
+
+def worlds_of(path, *overrides):
+    return load_worlds(path, None, overrides, CARRIER)
+
+
+def test_gains_are_not_left_beside_data_that_they_were_not_found_for(home, tmp_path):
+    path, seeds = home / "secret.yaml", "corruption.noise.seeds=[17, 18]"
+    [case] = worlds_of(path).cases
+    data = (DataSet(name="data-1", file="data-1.uvh5", digest="a"),)
+    manifest = Manifest(calstudy="0", digest=WorldData.of(case.experiment).digest, data=data)
+    (tmp_path / MANIFEST).write_text(manifest.model_dump_json())
+    assert folders_of(worlds_of(path, seeds), tmp_path, "uvh5", True) == [tmp_path]
+    for name in ("data-1.calh5", "data-1.model.uvh5"):
+        (tmp_path / name).touch()
+    assert folders_of(worlds_of(path), tmp_path, "uvfits", True) == [tmp_path]
+    told = r"holds what was returned for other data, data-1.calh5, data-1.model.uvh5; move these files away"
+    with pytest.raises(InputError, match=told):
+        folders_of(worlds_of(path, seeds), tmp_path, "uvh5", True)
+
+
+def test_several_worlds_are_not_written_below_the_manifest_of_one(tmp_path):
+    (tmp_path / MANIFEST).touch()
+    with pytest.raises(InputError, match=r"has the manifest.json of a single world, .*; use another folder"):
+        folders_of(worlds_of(ROOT / "experiments" / "challenge.yaml"), tmp_path, "uvh5", True)
+
+
+def test_another_format_replaces_the_data_of_an_export_and_nothing_else(exported, home, tmp_path):
+    folder = tmp_path / "again"
+    shutil.copytree(exported, folder)
+    kept = {"data-1.calh5", "data-1.model.uvh5", "data-9.uvh5", "notes.txt"}
+    for name in kept:
+        (folder / name).touch()
+    command("export", home / "secret.yaml", "--output", folder, "--format", "uvfits", "--overwrite", "--workers", 1)
+    written = {MANIFEST, "README.md", "sky-model.uvfits", *(f"{name}.uvfits" for name in NAMES)}
+    assert {path.name for path in folder.iterdir()} == written | kept
+    for place, told in ((folder, True), (exported, False)):
+        assert ("gains found from the columns of the files must be" in (place / "README.md").read_text()) == told
 
 
 def test_gains_of_the_other_convention_are_inverted(skycal, home, tmp_path):

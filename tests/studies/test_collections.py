@@ -236,6 +236,8 @@ def test_members_that_were_run_elsewhere_are_compared_without_being_run(finished
     assert {task.stage.name for task in result.made.tasks} == {"figure", "claims"}
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {result.folder.name}
     assert result.folder.name == finished.folder.name
+    told = [*result.warnings, *json.loads((result.folder / "manifest.json").read_text())["warnings"]]
+    assert not any("no longer in the store" in warning for warning in told)
     for name in PAIR["figures"]:
         arrays = [np.load(run.folder / "figures" / f"{name}.npz") for run in (finished, result)]
         assert all(

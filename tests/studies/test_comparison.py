@@ -19,6 +19,7 @@ from calstudy.products.graph import Graph
 from calstudy.products.score import score
 from calstudy.products.signal_loss import transfer
 from calstudy.regression import accept, compare_figures, read_reference, read_run
+from calstudy.studies.kinds.comparison import load_worlds
 from calstudy.studies.load import load_study
 from calstudy.studies.study import Budget, Run, run_study
 
@@ -456,3 +457,19 @@ def test_an_input_file_of_a_scale_that_is_not_asked_for_may_be_missing(tmp_path)
     assert load_study(path).cases
     with pytest.raises(ExperimentError, match=r"elsewhere\.csv"):
         load_study(path, "there")
+
+
+def test_a_calibrator_of_a_file_has_the_name_of_the_file_as_label(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN_CALIBRATOR)
+    (tmp_path / f"{'mine' * 11}.py").write_text(OWN_CALIBRATOR)
+    path = tmp_path / "study.yaml"
+    for name, label in {"mine": "mine", "mine" * 11: "mine" * 10}.items():
+        path.write_text(yaml.safe_dump({**small(tmp_path), "calibration": {"calibrator": f"{name}.py"}}))
+        [case] = load_worlds(path, None, (), None).cases
+        assert case.calibrator == label
+
+
+def test_texts_that_look_like_numbers_stay_texts_in_the_run_folder(tmp_path):
+    path = comparison_file(tmp_path, calibrators={"none": "none"})
+    study = load_study(path, None, ["description='1e-3'"])
+    assert read_back(study, tmp_path / "run").description == "1e-3"

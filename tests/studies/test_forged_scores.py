@@ -23,7 +23,7 @@ from calstudy.instrument.telescope import make_template
 from calstudy.realdata.reading import read_metadata, read_visibilities
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import FileSources
-from calstudy.studies.scores import Scores, leaderboard
+from calstudy.studies.scores import Scores, leaderboard, tables
 
 NAMES = [
     "../gains",
@@ -296,3 +296,10 @@ def test_manifests_of_an_export_are_read(tmp_path):
     whole = Manifest(calstudy="0", digest="d", data=(DataSet(name="data-1", file="data-1.ms", digest="e"),))
     (tmp_path / MANIFEST).write_text(whole.model_dump_json())
     assert read_manifest(tmp_path / MANIFEST) == whole
+
+
+def test_a_refusal_counts_in_a_world_without_rows():
+    rows = (row("easy", "mine", (0, 0), 0.01, (0.9, 0.9)),)
+    found = tables(Scores(calstudy="0", name="c", rows=rows, refusals=(("hard", "mine", "no redundant baselines"),)))
+    assert list(found) == ["easy", "Which calibrator to trust"]
+    assert found["Which calibrator to trust"].rows[0][1:] == 2 * ("fails in hard (cannot work)",)

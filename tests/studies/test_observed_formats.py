@@ -215,6 +215,18 @@ def test_a_sky_model_of_other_antennas_is_refused(tmp_path):
         found.sized_to(Budget(workers=1))
 
 
+def test_a_sky_model_without_directions_has_the_feeds_of_the_data(tmp_path):
+    data = measurement(polarizations=("xx", "yy"))
+    data.telescope.set_feeds_from_x_orientation("north", feeds=["x", "y"])
+    data.write_uvh5(tmp_path / "data.uvh5")
+    data.telescope.set_feeds_from_x_orientation(None)
+    data.write_uvh5(tmp_path / "sky.uvh5")
+    graph = study(tmp_path, {"data": "data.uvh5", "sky_model": "sky.uvh5"}).graph
+    found, sky, notes = observed(graph, "even").read()
+    assert np.array_equal(to_cube(sky), to_cube(found))
+    assert "Sky model: The file does not tell the orientation of its feeds; x is taken to be north." in notes
+
+
 def test_sums_and_differences_of_a_correlator_give_back_its_two_samples(tmp_path):
     samples = {parity: measurement() for parity in PARITIES}
     samples["odd"].data_array *= 1j

@@ -311,6 +311,14 @@ def test_the_file_reads_back_from_the_run_folder(finished):
             {"corruption__noise__seeds": [3, 23]},
             "realizations: the seed 23 would be used for noise and for noise (seeds grow by 10",
         ),
+        (
+            {"corruption__effects": ["per-channel-gains", {"kind": "decoherence", "seed": 25}]},
+            "realizations: the seed 25 would be used for gains and for corruption.effects.1 (seeds grow by 10",
+        ),
+        (
+            {"instrument__as_built__positions": {"scatter": "1 cm", "seed": 13}},
+            "realizations: the seed 13 would be used for noise and for instrument.as_built.positions (seeds grow by 10",
+        ),
         ({"outputs__figures": ["wedge", "gains"]}, "outputs.figures: are figures of single runs"),
         ({"sweep": {"sky.eor.seed": [2, 3]}}, "realizations: cannot be asked for together with a sweep"),
         (

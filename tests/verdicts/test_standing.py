@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+from calstudy.calibrate import records
+from calstudy.verdicts import standing
 from calstudy.verdicts.standing import advice, standing_table, standings, why_not_measured
 
 WORLDS = ("ideal", "sources missing")
@@ -171,3 +173,14 @@ def test_the_smallest_t_is_not_said_of_worlds_where_it_is_not_measured():
             f"name keeps much (T ≥ 0.80 where measured, 1 of 2 worlds), but fails in sources missing ({reason})"
         )
     assert "where" not in str(standing_of(case(0.0, 0.01), case(0.0, 0.01)))
+
+
+def test_worlds_that_decide_begin_with_the_refused_and_those_without_a_known_bias():
+    biases = {"a": 1.0, "b": None, "c": 3.0, "d": None, "e": 2.0}
+    scores = {world: {"name": case(bias, 0.01, transfer=5.0)} for world, bias in biases.items()}
+    (found,) = standings({**scores, "f": {}}, [("f", "name", "no")])
+    assert "".join(world.world for world in found.decisive) == "fbdcea"
+
+
+def test_solves_are_settled_by_the_statuses_of_calibrations():
+    assert standing.SETTLED == records.SETTLED

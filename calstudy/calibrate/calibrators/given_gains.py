@@ -11,7 +11,7 @@ from __future__ import annotations
 import hmac
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -73,6 +73,7 @@ class ByFile(Calibrator):
     is subtracted.
     """
 
+    version: ClassVar[int] = 2
     calibrator: str = "by-file"
     chunks: int = Field(1, ge=1, description="Pieces of consecutive integrations.")
     folder: Path | None = Field(

@@ -190,8 +190,8 @@ class Collection(Family):
 
     @property
     def recorded(self) -> list[Task]:
-        """The products of the collection itself, and those of members that were run before."""
-        return [*(task for name in self.finished for task in self.studies[name].targets), *self.own]
+        """The products of the collection itself, and the tables of members that were run before."""
+        return [*(task for name in self.finished for task in self.studies[name].tables), *self.own]
 
     @property
     def entries(self) -> Mapping[str, Any]:

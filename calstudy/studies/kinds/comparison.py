@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-import yaml
 from pydantic import BeforeValidator, Field, field_validator
 
 from calstudy.base.errors import ExperimentError, InputError
@@ -26,6 +25,7 @@ from calstudy.experiment.files import (
     apply_scale,
     checked,
     dump,
+    dump_yaml,
     overridden,
     override,
     parse_override,
@@ -345,8 +345,10 @@ class Comparison(Family):
     @property
     def texts(self) -> Mapping[str, str]:
         """The file with its experiment, and the experiment of every case."""
-        whole = yaml.safe_dump(self.resolved, sort_keys=False, allow_unicode=True, width=100)
-        return {EXPERIMENT: whole, **{name: dump(case.experiment) for name, case in self._files.items()}}
+        return {
+            EXPERIMENT: dump_yaml(self.resolved),
+            **{name: dump(case.experiment) for name, case in self._files.items()},
+        }
 
     @property
     def entries(self) -> Mapping[str, Any]:
@@ -421,7 +423,7 @@ def load_worlds(
         )
     plain = experiment.model_dump(mode="json")
     own = plain["calibration"]
-    blocks = {own["calibrator"]: own} if calibrators is None else calibrators
+    blocks = {experiment.calibration.label[:LONGEST_LABEL]: own} if calibrators is None else calibrators
     content = {
         "name": experiment.name,
         "description": experiment.description,

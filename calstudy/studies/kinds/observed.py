@@ -23,6 +23,7 @@ from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataFile, DataStudy, read_file, read_selected
 from calstudy.studies.kinds.experiment import content_of
+from calstudy.studies.preflight import require_fine_maps
 
 DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
@@ -117,6 +118,8 @@ def _halves(file: ObservedFile) -> Parts:
     odd = read_selected(file, section.odd) if section.odd else even
     for facts in (even, odd):
         require_antennas(file.power, facts.frame.numbers, "leave them out by observed.select.antennas")
+        if file.injection is not None:
+            require_fine_maps(file.injection.eor, facts.frame.lengths, facts.channels.band, "injection.eor")
     if section.odd:
         require_same_sky(even, odd, section.sky_model)
     elif section.difference:
