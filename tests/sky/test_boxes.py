@@ -272,7 +272,7 @@ def test_slices_must_be_equally_far_apart(tmp_path):
 
 
 def study(folder, path, **fields):
-    eor = {"spectrum": "box", "path": str(path), "nside": 16}
+    eor = {"spectrum": "box", "path": str(path), "nside": 64}
     instrument = {**TINY["instrument"], "channels": {"first": f"{BAND[0]} Hz", "width": "100 kHz", "count": 21}}
     sky = {**TINY["sky"], "eor": eor}
     return ExperimentStudy(validate({**tiny(folder), "instrument": instrument, "sky": sky, **fields}, folder))
