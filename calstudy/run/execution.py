@@ -27,7 +27,7 @@ from calstudy.base.identity import identity
 from calstudy.base.quiet import errors_written_to, write_errors_to
 from calstudy.base.resources import Usage, cores, free_memory, parse_memory
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
-from calstudy.run.store import Product, Store
+from calstudy.run.store import Product, Store, keep
 from calstudy.run.task import Task, unique
 
 if TYPE_CHECKING:
@@ -531,8 +531,8 @@ class Lifetimes:
 
     def __init__(self, targets: Iterable[Task], todo: Sequence[Task]) -> None:
         tasks = _all_tasks(targets)
-        kept = {task.key for task in tasks if not task.temporary}
-        self._temporary = {task.key: task for task in tasks if task.key not in kept}
+        self._kept = {task.key: task for task in tasks if not task.temporary}
+        self._temporary = {task.key: task for task in tasks if task.key not in self._kept}
         self._users = dict.fromkeys(self._temporary, 0)
         for task in todo:
             for key in self._needed_by(task):
@@ -540,6 +540,12 @@ class Lifetimes:
 
     def _needed_by(self, task: Task) -> set[str]:
         return {needed.key for needed in task.needs.values()} & self._temporary.keys()
+
+    def keep_found(self, store: Store) -> None:
+        """Make existing products stay that a run keeps, though another one made them as temporary ones."""
+        for product in found_of(self._kept.values(), store).values():
+            if product.record.get("temporary"):
+                keep(product)
 
     def unused(self) -> list[Task]:
         """Return the tasks of temporary products that no remaining task needs."""

@@ -33,7 +33,7 @@ from uuid import uuid4
 from filelock import FileLock, Timeout
 
 from calstudy.base.errors import InputError, error_number, errors_of_files
-from calstudy.base.files import digest_json, sha256
+from calstudy.base.files import digest_json, replacing, sha256
 from calstudy.run.task import Task
 
 RECORD, DIGEST = "product.json", "digest"
@@ -245,14 +245,23 @@ class Store:
         }
         # The record as it will be read: JSON has no tuples, and only text as keys.
         complete = json.loads(json.dumps({**record, "files": files}, allow_nan=False))
-        with (folder / RECORD).open("w", encoding="utf-8") as file:
-            json.dump({**complete, DIGEST: digest_json(complete)}, file, indent=1, sort_keys=True)
-            file.flush()
-            os.fsync(file.fileno())
+        _write_record(folder, complete)
         final = self.folder(record["stage"], record["key"])
         self.discard(record["stage"], record["key"])
         folder.rename(final)
         return Product(final, complete, made=True)
+
+
+def keep(product: Product) -> None:
+    """Record that a product which was made as a temporary one is to stay; nothing is done in a read-only store."""
+    with suppress(OSError):
+        _write_record(product.path, {**product.record, "temporary": False})
+
+
+def _write_record(folder: Path, record: Mapping[str, Any]) -> None:
+    text = json.dumps({**record, DIGEST: digest_json(record)}, indent=1, sort_keys=True)
+    with replacing(folder / RECORD) as stream:
+        stream.write(text.encode())
 
 
 def products(store: Store) -> Iterator[Product]:

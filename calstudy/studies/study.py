@@ -316,6 +316,7 @@ def _make_missing(
         logger.warning(message)
         console.print(message, markup=False)
     lifetimes = Lifetimes(targets, plan.todo)
+    lifetimes.keep_found(store)
     lease.drop(lifetimes.unused())
     costs = {task.key: task.cost.seconds for task in plan.todo}
     with report(plan.todo, costs, workers.count, console) as show:

@@ -180,6 +180,17 @@ def test_a_product_that_another_run_made_to_be_kept_is_not_dropped(store):
     assert found == [True, True, False, True]
 
 
+def test_a_temporary_product_that_a_later_run_keeps_is_not_dropped(store):
+    """A run that was interrupted has made the first half as a temporary product; it resumes after another run."""
+    kept, fleeting = chain(temporary=False), chain(temporary=True)
+    run(fleeting[1], store)
+    Lifetimes([kept[1]], ()).keep_found(store)
+    run(fleeting[-1], store)
+    Lease(store).drop(Lifetimes([fleeting[-1]], ()).unused())
+    found = [store.verify("number", task.key) is not None for task in kept]
+    assert found == [True, True, False, True]
+
+
 def test_the_disk_of_a_plan_counts_what_is_there_at_one_time(store):
     pieces = [Sized(f"piece {index}", number=index, temporary=True) for index in range(5)]
     reduced = [Sized(f"reduced {index}", number=1, needed={"piece": piece}) for index, piece in enumerate(pieces)]
