@@ -238,7 +238,11 @@ class Eor(Section):
         "the redshift of the data. For spectrum: box, a coeval box or a lightcone saved by 21cmFAST 3 or 4, whose P(k) "
         "is used as such a table. P is a power law between two k, and constant beyond the first and the last.",
     )
-    nside: Literal[16, 32, 64, 128, 256] = Field(256, description="HEALPix resolution.")
+    nside: Literal[16, 32, 64, 128, 256] = Field(
+        256,
+        description="HEALPix resolution; unless the spectrum is flat, 3 nside - 1 must be above the multipoles that "
+        "the longest baseline sees.",
+    )
     seed: int = Field(2, ge=0, description="Seed of the maps.")
 
     @model_validator(mode="after")

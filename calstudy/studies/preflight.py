@@ -33,6 +33,8 @@ LONG_AVERAGE = 15.0
 """Minutes; the sky moves by a sixth of the beam of an MWA tile."""
 APERTURE = 5.0
 """Width of antennas, which see multipoles about that of their baseline, m."""
+FINEST = 256
+"""Largest nside of an EoR."""
 SNAPSHOTS = 0.02
 """Of 1 + z: how far coeval boxes of 21cmFAST are apart by default."""
 
@@ -65,21 +67,35 @@ def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
 
 
 def require_fine_maps(eor: Eor, lengths: np.ndarray, band: tuple[float, float], field: str) -> None:
-    """Raise InputError if maps of an EoR lack what the longest baseline sees; baseline `lengths` are in m.
+    """Raise InputError if finer maps of an EoR have what the longest baseline sees; baseline `lengths` are in m.
 
     Maps of a spectrum that is not flat end at l = 3 nside - 1. Beyond it baselines see replicas of what is below, with
     a sixth to all of the power of the spectrum. `field` is the name of the EoR's section.
     """
-    if eor.spectrum == "flat" or not lengths.size:
-        return
-    longest, most = lengths.max(), 3 * eor.nside - 1
-    seen = 2 * math.pi * (longest + APERTURE) * band[1] / SPEED_OF_LIGHT
-    if seen > most:
-        enough = 2 ** math.ceil(math.log2((seen + 1) / 3))
+    longest, seen = lengths.max(initial=0.0), _multipole(lengths.max(initial=0.0), band)
+    enough = min(2 ** math.ceil(math.log2((seen + 1) / 3)), FINEST)
+    if eor.spectrum != "flat" and eor.nside < enough:
         raise InputError(
-            f"{field}.nside = {eor.nside}: maps of a {eor.spectrum} spectrum have multipoles up to {most}, and "
-            f"baselines of {longest:.0f} m see multipoles up to {seen:.0f}; give at least {enough}, or spectrum: flat"
+            f"{field}.nside = {eor.nside}: maps of a {eor.spectrum} spectrum have multipoles up to {3 * eor.nside - 1} "
+            f"and baselines of {longest:.0f} m see those up to {seen:.0f}; give at least {enough}, or spectrum: flat"
         )
+
+
+def note_of_maps(eor: Eor, lengths: np.ndarray, band: tuple[float, float], field: str) -> str:
+    """Say which baselines see more than the finest maps have; an empty text if none does."""
+    most = 3 * eor.nside - 1
+    if eor.spectrum == "flat" or _multipole(lengths.max(initial=0.0), band) <= most:
+        return ""
+    resolved = most * SPEED_OF_LIGHT / (2 * math.pi * band[1]) - APERTURE
+    return (
+        f"{field}.nside = {eor.nside}: maps of a {eor.spectrum} spectrum have multipoles up to {most}; baselines of "
+        f"more than {resolved:.0f} m see others, with less than the power of the spectrum"
+    )
+
+
+def _multipole(length: float, band: tuple[float, float]) -> float:
+    """Return the largest multipole that a baseline sees at the end of the band; the length is in m."""
+    return 2 * math.pi * (length + APERTURE) * band[1] / SPEED_OF_LIGHT
 
 
 def require_beams(instrument: InstrumentSettings) -> None:
@@ -101,7 +117,7 @@ def _require_small_errors(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    found = (_needless_limit, _average, _needless_chunks, _needless_pieces, _distant_box)
+    found = (_needless_limit, _average, _needless_chunks, _needless_pieces, _distant_box, _coarse_maps)
     return tuple(note for note in (note(experiment) for note in found) if note)
 
 
@@ -160,6 +176,11 @@ def _average(experiment: Experiment) -> str:
         f"power.coherent_time = null: all {minutes:.0f} min are averaged coherently. A sky that drifts through the "
         "beam loses power in it, the EoR as well; such as '10 min' averages the powers of blocks"
     )
+
+
+def _coarse_maps(experiment: Experiment) -> str:
+    instrument = experiment.instrument
+    return note_of_maps(experiment.sky.eor, frame_of(instrument).lengths, instrument.channels.band, "sky.eor")
 
 
 def _distant_box(experiment: Experiment) -> str:

@@ -16,7 +16,7 @@ from calstudy.base.errors import InputError
 from calstudy.power.cosmology import input_power
 from calstudy.sky.eor import HYDROGEN_LINE, EorField, comoving_geometry
 from calstudy.sky.settings import Eor
-from calstudy.studies.preflight import APERTURE, require_fine_maps
+from calstudy.studies.preflight import APERTURE, note_of_maps, require_fine_maps
 
 CHANNELS = 167.075e6 + 80e3 * np.arange(384)
 FEW = CHANNELS[:24]
@@ -238,12 +238,23 @@ def power_of_baselines(eor: Eor, length: float) -> float:
     return float(np.mean(np.abs(visibilities) ** 2 / density))
 
 
+def test_baselines_that_the_finest_maps_do_not_resolve_are_named():
+    """At 180 MHz maps of nside 256 have what baselines of 767 c / 2 pi nu - 5 m = 198 m see."""
+    law, band = Eor(spectrum="power-law", index=-1.0, nside=256), (150e6, 180e6)
+    require_fine_maps(law, np.array([14.0, 876.0]), band, "sky.eor")
+    assert note_of_maps(law, np.array([14.0, 198.0]), band, "sky.eor") == ""
+    assert "baselines of more than 198 m see others" in note_of_maps(law, np.array([14.0, 876.0]), band, "sky.eor")
+    assert note_of_maps(Eor(nside=256), np.array([876.0]), band, "sky.eor") == ""
+    with pytest.raises(InputError, match="give at least 256"):
+        require_fine_maps(law.model_copy(update={"nside": 128}), np.array([876.0]), band, "sky.eor")
+
+
 def test_maps_that_are_fine_enough_have_the_power_of_the_input_and_others_have_not():
     """A P(k) of index 0 is as flat as the flat one, whose pixels are white, but its maps end at l = 3 nside - 1."""
     law = [Eor(spectrum="power-law", index=0.0, nside=16, seed=seed) for seed in range(6)]
     limit = 47 * SPEED_OF_LIGHT / (2 * np.pi * FEW.max()) - APERTURE
     require_fine_maps(law[0], np.array([0.99 * limit]), (FEW.min(), FEW.max()), "sky.eor")
-    with pytest.raises(InputError, match=r"sky.eor.nside = 16: .* see multipoles up to 48; give at least 32"):
+    with pytest.raises(InputError, match=r"sky.eor.nside = 16: .* see those up to 48; give at least 32"):
         require_fine_maps(law[0], np.array([1.02 * limit]), (FEW.min(), FEW.max()), "sky.eor")
     require_fine_maps(Eor(nside=16), np.array([1e3]), (FEW.min(), FEW.max()), "sky.eor")
     # 144 maps, of which a baseline sees one mode each; its ten directions are nearly independent.

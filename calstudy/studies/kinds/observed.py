@@ -23,7 +23,7 @@ from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.calibration import DataFile, DataStudy, read_file, read_selected
 from calstudy.studies.kinds.experiment import content_of
-from calstudy.studies.preflight import require_fine_maps
+from calstudy.studies.preflight import note_of_maps, require_fine_maps
 
 DEFAULT_FIGURES = ("diagnostics", "observed-wedge", "observed-spherical")
 INJECTION_FIGURES = ("observed-signal-loss",)
@@ -81,6 +81,15 @@ class ObservedStudy(DataStudy):
                 self.file.calibration.label,
             )
         )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The notes of a calibration, and which baselines see more of the injected EoR than its maps have."""
+        facts, injection = self.data.facts["even"], self.file.injection
+        if injection is None:
+            return super().notes
+        note = note_of_maps(injection.eor, facts.frame.lengths, facts.channels.band, "injection.eor")
+        return (*super().notes, *([note] if note else []))
 
     @property
     def content(self) -> Any:
