@@ -179,8 +179,8 @@ Reader = Callable[["Path"], GainTable]
 def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -> UVCal:
     """Read gains in any format; `where` names the source of the path in errors.
 
-    `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Feeds have the
-    names that they have there. Raises InputError if the file does not exist, has none of the formats, takes data from
+    `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Feeds are named
+    as there. Raises InputError if the file does not exist, has none of the formats, takes data from
     other files, does not fit the template, or is a CASA table and the package that reads it is missing.
     """
     found = read_gain_file(path, where, None if template is None else x_in_file(template))

@@ -128,8 +128,8 @@ class Observe(Task, stage="observe", version=5):
     """The data of one part, and the sky model.
 
     The noise is that of a sample with nsamples of one since version 2, and has the mean of inverse variances since 3.
-    Samples of no measurement are flagged since 4. Windows are in the order of their frequencies since 5, and feeds that
-    were renamed are told.
+    Samples of no measurement are flagged since 4. Windows are in the order of their frequencies since 5, and data with
+    renamed feeds have a keyword that says so.
     """
 
     files: Sequence[Path]

@@ -158,7 +158,7 @@ def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: boo
 
 
 def antenna_text(data: UVData, number: int) -> str:
-    """Return how a selection says an antenna: its number, marked as such if that is the name of another one."""
+    """Return the text that selects an antenna: its number, marked as such if that is the name of another one."""
     return str(number) if _by_name(data).get(str(number), number) == number else f"number:{number}"
 
 

@@ -542,7 +542,7 @@ class Lifetimes:
         return {needed.key for needed in task.needs.values()} & self._temporary.keys()
 
     def keep_found(self, store: Store) -> None:
-        """Make existing products stay that a run keeps, though another one made them as temporary ones."""
+        """Make temporary products of other runs stay if this run keeps them."""
         for product in found_of(self._kept.values(), store).values():
             if product.record.get("temporary"):
                 keep(product)

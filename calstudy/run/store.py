@@ -253,7 +253,7 @@ class Store:
 
 
 def keep(product: Product) -> None:
-    """Record that a product which was made as a temporary one is to stay; nothing is done in a read-only store."""
+    """Make a temporary product one that stays; in a read-only store nothing is changed."""
     with suppress(OSError):
         _write_record(product.path, {**product.record, "temporary": False})
 

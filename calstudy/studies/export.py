@@ -191,7 +191,7 @@ def _write(uvd: UVData, path: Path, single: bool) -> None:
 def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
     names = [item.name for item in manifest.data]
     conjugates = (
-        f" Visibilities are meant as pyuvdata reads them: {file_format} files hold their complex conjugates, so that "
+        f" Visibilities are as pyuvdata reads them: {file_format} files hold their complex conjugates, so that "
         "gains found from the columns of the files must be conjugated in CalH5 or calfits files, but not in those of "
         "DP3, hyperdrive and calibrate."
     )

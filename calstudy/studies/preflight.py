@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import get_args
 
 import numpy as np
 
@@ -33,7 +34,7 @@ LONG_AVERAGE = 15.0
 """Minutes; the sky moves by a sixth of the beam of an MWA tile."""
 APERTURE = 5.0
 """Width of antennas, which see multipoles about that of their baseline, m."""
-FINEST = 256
+FINEST = max(get_args(Eor.model_fields["nside"].annotation))
 """Largest nside of an EoR."""
 SNAPSHOTS = 0.02
 """Of 1 + z: how far coeval boxes of 21cmFAST are apart by default."""

@@ -52,7 +52,7 @@ def marked(text: str, transfer: float | None, error: float | None) -> str:
 
 
 def settled(solves: Mapping[str, int]) -> int:
-    """Return how many solves ended at a solution, of their numbers by status."""
+    """Count the solves that ended at a solution, given their numbers by status."""
     return sum(solves.get(status, 0) for status in SETTLED)
 
 
@@ -65,7 +65,7 @@ AT_LIMIT, OUT_OF_REACH = 1.05, 1000.0
 """Factors by which errors must be smaller to tell: below the first the bias is near the limit; those beyond the second
 are not named."""
 SETTLED = ("converged", "by-file")
-"""Statuses of solves that are no reason for doubt, as in `calstudy.calibrate.records`."""
+"""Statuses of solves that ended at a solution, as in `calstudy.calibrate.records`."""
 NAMED = 3
 """Number of worlds, and of calibrators that fail in few, that are named; others are counted."""
 MORE = 0.02
