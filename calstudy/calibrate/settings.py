@@ -247,7 +247,7 @@ class ForegroundPrior(Section):
 
     # Finite priors are fitted in double precision since 2, wherever many steps are needed since 3.
     mean: Literal["none", "sky-model"] = Field(
-        "none", description="What is assumed of the foregrounds.", json_schema_extra={REVISED: 3}
+        "none", description="What is assumed of the foregrounds.", json_schema_extra={REVISED: 4}
     )
     deviation: Deviation = Field(
         "infinite",

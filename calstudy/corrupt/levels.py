@@ -46,6 +46,16 @@ def rms(visibilities: np.ndarray) -> float:
     return float(np.sqrt(np.mean(visibilities.real**2 + visibilities.imag**2)))
 
 
+def noise_of_samples(noise: float | np.ndarray, amplitudes: np.ndarray, used: np.ndarray) -> float:
+    """Return sigma of the noise of samples after gains; its inverse square is the mean of their inverse variances.
+
+    `noise` is sigma before gains, a number or (Nfreqs, Npols). `amplitudes`, |g_a g_b|, and `used`, bool, broadcast to
+    (Ntimes, Nbls, Nfreqs, Npols). Samples that are not used, or whose gains are zero, do not count.
+    """
+    sigma, used = np.broadcast_arrays(noise * amplitudes, used & (amplitudes > 0))
+    return float(np.mean(1 / sigma[used] ** 2) ** -0.5) if used.any() and np.any(noise) else 0.0
+
+
 def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np.ndarray:
     """Return the standard deviation of the complex noise, V_aa / sqrt(width integration nights), Jy, (Nfreqs, Npols).
 

@@ -54,7 +54,7 @@ def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str,
     return {
         "data": corruption.data(graph, variant, parity),
         "sky_model": sky_model.sky_model(graph),
-        "levels": corruption.levels(graph) if calibrator.needs_noise else None,
+        "levels": corruption.noise_level(graph, variant) if calibrator.needs_noise else None,
         "autocorrelations": corruption.autocorrelations(graph, variant, parity) if calibrator.needs_autos else None,
     }
 
@@ -139,10 +139,7 @@ class Calibrated(Task):
             data = with_autocorrelations(data, read_visibilities(self.autocorrelations / DATA, times))
             if sky is not None:
                 sky, data, _ = common_baselines(sky, data, autos=False)
-        if self.levels is None:
-            return data, sky, None
-        # The level is that of the data, and of an average of several nights not that of one.
-        return data, sky, read_json(self.levels / LEVELS)["noise_std"] * float(np.sqrt(data.nsample_array.max()))
+        return data, sky, None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]
 
 
 class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):

@@ -15,7 +15,7 @@ from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_rows, flag_cube, from_cube, positions, to_cube
 from calstudy.corrupt.interface import Effect, GainEffect, apply_effect, draw_flags, draw_truth
-from calstudy.corrupt.levels import Levels, radiometer_std, rms, set_levels
+from calstudy.corrupt.levels import Levels, noise_of_samples, radiometer_std, rms, set_levels
 from calstudy.corrupt.noise import Noise, NoNoise, RadiometerNoise, thermal_noise
 from calstudy.corrupt.noise import autocorrelations as draw
 from calstudy.experiment.model import Variant
@@ -84,13 +84,34 @@ def levels(graph: Graph) -> Task:
 
 
 @memoize
+def noise_level(graph: Graph, variant: Variant) -> Task:
+    """Return the task of the level of the noise of the data of a variant, as a calibrator may know it."""
+    flagging = _flagging(graph)
+    return MeasureNoise(
+        "noise of corrupted data" if variant.effects else "noise of data",
+        instrument=_antennas(graph, [effect for effect, _ in flagging]),
+        nights=_nights(graph.experiment.corruption.noise),
+        flagged_by=tuple(effect for effect, _ in flagging),
+        levels=levels(graph),
+        gains=gains(graph) if variant.effects else None,
+        truth=tuple(truth for _, truth in flagging),
+    )
+
+
+def _flagging(graph: Graph) -> list[tuple[Effect, Task]]:
+    """Return the effects that flag, with the tasks that draw their truth."""
+    effects = graph.experiment.corruption.effects
+    return [(effect, _truth(graph, place)) for place, effect in enumerate(effects) if effect.can_flag]
+
+
+@memoize
 def data(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of one noise realization ("even" or "odd") of a variant before calibration."""
     experiment = graph.experiment
     # All variants need the same samples, because they are compared and provide errors for each other.
-    flagging = [place for place, effect in enumerate(experiment.corruption.effects) if effect.can_flag]
+    flagging = _flagging(graph)
     effects = experiment.corruption.effects if variant.effects else ()
-    acting = effects or [experiment.corruption.effects[place] for place in flagging]
+    acting = effects or tuple(effect for effect, _ in flagging)
     label, seed = " + ".join(variant.components), None
     if "noise" in variant.components:
         noise = experiment.corruption.noise
@@ -106,11 +127,11 @@ def data(graph: Graph, variant: Variant, parity: str) -> Task:
         noise_seed=seed,
         nights=_nights(experiment.corruption.noise),
         effects=tuple(effects),
-        flagged_by=() if effects else tuple(acting),
+        flagged_by=() if effects else acting,
         levels=levels(graph),
         foregrounds=simulation.foregrounds(graph) if "foregrounds" in variant.components else None,
         eor=simulation.eor(graph) if "eor" in variant.components else None,
-        truth=truths(graph) if effects else tuple(_truth(graph, place) for place in flagging),
+        truth=truths(graph) if effects else tuple(truth for _, truth in flagging),
         temporary=not graph.keep_visibilities,
     )
 
@@ -277,13 +298,10 @@ class Corrupt(Task, stage="corrupt", version=2):
         if self.noise_seed is not None:
             cube += thermal_noise(cube.shape, found.noise, self.noise_seed)
         observation = Observation(make_template(self.instrument, as_built=True))
-        flags = np.zeros(cube.shape, dtype=bool)
-        for effect, folder in zip(self.effects or self.flagged_by, self.truth, strict=True):
-            truth = read_truth(folder)
-            if self.effects:
-                cube = apply_effect(effect, cube, observation, truth)
-            if (flagged := draw_flags(effect, observation, truth)) is not None:
-                flags |= flagged
+        if self.effects:
+            for effect, folder in zip(self.effects, self.truth, strict=True):
+                cube = apply_effect(effect, cube, observation, read_truth(folder))
+        flags = _flags(self.effects or self.flagged_by, self.truth, observation)
         data = from_cube(template, cube)
         flag_cube(data)[:] = flags
         data.nsample_array[:] = self.nights or 1
@@ -299,6 +317,48 @@ class Corrupt(Task, stage="corrupt", version=2):
         seconds = 0.2 + size.samples * 1.3e-7 + sum(cost.seconds for cost in effects)
         memory = LIBRARIES_MEMORY + 5 * size.samples * COMPLEX128 + max((cost.memory for cost in effects), default=0.0)
         return Cost(seconds, memory, size.samples * COMPLEX64)
+
+
+def _flags(effects: Sequence[Effect], truths: Sequence[Path], observation: Observation) -> np.ndarray:
+    """Return the flags of effects, (Ntimes, Nbls, Nfreqs, Npols), of which products hold the truth."""
+    flags = np.zeros(observation.shape, dtype=bool)
+    for effect, folder in zip(effects, truths, strict=True):
+        if effect.can_flag and (flagged := draw_flags(effect, observation, read_truth(folder))) is not None:
+            flags |= flagged
+    return flags
+
+
+class MeasureNoise(Task, stage="noise-level", version=1):
+    """The standard deviation of the noise of samples of the data with nsamples of one."""
+
+    instrument: InstrumentSettings
+    nights: int | None = None
+    flagged_by: tuple[Effect, ...] = ()
+    levels: Input
+    gains: Input = None
+    truth: tuple[Input, ...] = ()
+
+    def make(self, output: Path) -> Mapping[str, Any]:
+        """Write the standard deviation to levels.json."""
+        from calstudy.instrument.telescope import make_template
+
+        sigma = Levels(**read_json(self.levels / LEVELS)).noise * np.sqrt(self.nights or 1)
+        observation = Observation(make_template(self.instrument, as_built=True))
+        used = ~_flags(self.flagged_by, self.truth, observation) & ~observation.autos[:, None, None]
+        amplitudes = np.ones((1, 1, 1, 1))
+        if self.gains is not None:
+            true = read_gains(self.gains / GAINS, "true gains")
+            rows = positions(true.ant_array, observation.numbers)
+            of_antennas = np.abs(true.gain_array[rows]).transpose(2, 0, 1, 3)
+            first, second = observation.antennas.T
+            amplitudes = of_antennas[:, first] * of_antennas[:, second]
+        noise = noise_of_samples(sigma, amplitudes, used)
+        write_json(output / LEVELS, {"noise_std": noise})
+        return {"noise_jy": noise}
+
+    def _cost(self) -> Cost:
+        samples = size_of(self).samples
+        return Cost(0.2 + 5e-8 * samples, LIBRARIES_MEMORY + 5 * samples * COMPLEX64, 1e5)
 
 
 class Autocorrelate(Task, stage="autocorrelations", version=1):

@@ -155,14 +155,14 @@ def _write_world(content: WorldData, products: Mapping[str, Product], folder: Pa
     if model is not None:
         sky = read_visibilities(products[model.key].path / VISIBILITIES)
         _write(_at(template, sky), folder / f"{SKY_MODEL}.{file_format}", single=False)
-    levels = content.levels
+    level = content.noise_level
     manifest = Manifest(
         calstudy=__version__,
         digest=content.digest,
         data=tuple(sets),
         sky_model=None if model is None else f"{SKY_MODEL}.{file_format}",
         sky_model_digest=None if model is None else salted(model.key, content.salt),
-        noise=None if levels is None else read_json(products[levels.key].path / LEVELS)["noise_std"],
+        noise=None if level is None else read_json(products[level.key].path / LEVELS)["noise_std"],
     )
     write(folder / README, _readme(manifest, template, file_format))
     write(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
@@ -220,7 +220,8 @@ def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
         phase="The telescope drifts: data are not phased." if file_format == "uvh5" else phased,
         noise="The data have no noise."
         if manifest.noise is None
-        else f"The standard deviation of their complex noise, before any gains, is {manifest.noise:.6g} Jy.",
+        else f"The standard deviation of the complex noise of a measurement is {manifest.noise:.6g} Jy; where gains make "
+        "samples differ, its inverse square is the mean of their inverse variances.",
     )
 
 

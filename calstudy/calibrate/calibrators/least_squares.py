@@ -131,7 +131,8 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     # Directions that only the prior determines are fitted in double precision since 5.
     # So are fits that need many steps since 6.
     # Where weights run away, the result is that of equal weights since 7, in every integration.
-    version: ClassVar[int] = 7
+    # The noise is that of the data, after gains and for the number of measurements, since 8.
+    version: ClassVar[int] = 8
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -148,7 +149,8 @@ class Unified(_LeastSquares, ForegroundFit):
     # Directions that only the prior determines are fitted in double precision since 5.
     # So are fits that need many steps since 6.
     # Where weights run away, the result is that of equal weights since 7, in every integration.
-    version: ClassVar[int] = 7
+    # The noise is that of the data, after gains and for the number of measurements, since 8.
+    version: ClassVar[int] = 8
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
     prior: ScalePrior = "sky-model"
@@ -165,7 +167,8 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
     # So are fits that need many steps since 5.
     # Where weights run away, the result is that of equal weights since 6, in every integration, and of the deviation
     # that is estimated with these since 7.
-    version: ClassVar[int] = 7
+    # The noise is that of the data, after gains and for the number of measurements, since 8.
+    version: ClassVar[int] = 8
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
     prior: ScalePrior = "sky-model"

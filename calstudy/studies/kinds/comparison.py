@@ -362,13 +362,13 @@ class WorldData:
     """The tasks of the exported products of one experiment, which calibrates data with the EoR and without.
 
     Data sets are in the order of their digests, which does not reveal their content. The sky model is None if the
-    calibrator has none, and so are the levels without noise; the salt of a blind challenge may be empty.
+    calibrator has none, and so is the level of noise if there is none; the salt of a blind challenge may be empty.
     """
 
     experiment: Experiment
     data: tuple[Task, ...]
     sky_model: Task | None
-    levels: Task | None
+    noise_level: Task | None
     salt: str = ""
 
     @classmethod
@@ -385,7 +385,7 @@ class WorldData:
             experiment,
             tuple(data[key] for key in sorted(data, key=lambda key: salted(key, salt))),
             sky_model.sky_model(graph),
-            corruption.levels(graph) if noisy else None,
+            corruption.noise_level(graph, variants[0]) if noisy else None,
             salt,
         )
 
@@ -398,7 +398,7 @@ class WorldData:
     @property
     def tasks(self) -> list[Task]:
         """All tasks."""
-        return [*self.data, *(task for task in (self.sky_model, self.levels) if task is not None)]
+        return [*self.data, *(task for task in (self.sky_model, self.noise_level) if task is not None)]
 
 
 def load_worlds(
