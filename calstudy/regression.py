@@ -276,8 +276,12 @@ def compare_array(
         return ArrayComparison(figure, name, status, tolerance="equal", why=rule.why, problem=problem)
     if not _same_where_not_finite(old, made):
         return ArrayComparison(figure, name, _worst(rule), problem="finite in other places, or not alike")
-    relative = _relative(old, made)
-    deviations = _deviations(rule, reference, name, made) if isinstance(rule, Drawn) else None
+    relative, deviations = _relative(old, made), None
+    if isinstance(rule, Drawn):
+        sigma = np.broadcast_to(np.sqrt(2) * rule.error(reference, name), old.shape)
+        if _relative(old, made, ~(sigma > 0)) > ROUNDING:
+            return ArrayComparison(figure, name, "beyond", relative, problem="moved where the reference has no error")
+        deviations = _deviations(name, old, made, sigma)
     if relative <= ROUNDING and (deviations is None or deviations[0] <= ROUNDING):
         status = "same"
     elif isinstance(rule, Fixed) or (isinstance(rule, Drawn) and deviations and _too_far(rule, deviations)):
@@ -299,18 +303,16 @@ def _too_far(rule: Drawn, deviations: tuple[float, float, float]) -> bool:
     return largest > rule.largest or rms > rule.rms or abs(shift) > rule.shift
 
 
-def _relative(old: np.ndarray, made: np.ndarray) -> float:
+def _relative(old: np.ndarray, made: np.ndarray, among: np.ndarray | bool = True) -> float:
+    """Return the largest difference, among some elements, over the largest magnitude of the reference."""
     finite = np.isfinite(old)
-    if not finite.any():
-        return 0.0
-    difference, scale = np.abs(made[finite] - old[finite]).max(), np.abs(old[finite]).max()
+    used, scale = finite & among, np.abs(old[finite]).max(initial=0)
+    difference = np.abs(made[used] - old[used]).max(initial=0)
     return float(difference / scale) if scale > 0 else float(difference)
 
 
-def _deviations(rule: Drawn, reference: Arrays, name: str, made: np.ndarray) -> tuple[float, float, float]:
-    """Return the largest, rms and mean deviation in σ of a difference; elements without an error bar are left out."""
-    old = reference[name]
-    sigma = np.broadcast_to(np.sqrt(2) * rule.error(reference, name), old.shape)
+def _deviations(name: str, old: np.ndarray, made: np.ndarray, sigma: np.ndarray) -> tuple[float, float, float]:
+    """Return the largest, rms and mean of a difference in its σ; elements without a finite error bar are left out."""
     usable = np.isfinite(old) & np.isfinite(sigma) & (sigma > 0)
     difference = made[usable] - old[usable]
     sigma = sigma[usable]

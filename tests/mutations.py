@@ -73,6 +73,18 @@ MUTATIONS = (
         "1 / (1 - amplitude * np.exp(",
         CORRUPTION,
     ),
+    Mutation(
+        "a prior weighed against the noise before the gains",
+        "            amplitudes = of_antennas[:, first] * of_antennas[:, second]\n",
+        "",
+        ("tests/products/test_noise_level.py",),
+    ),
+    Mutation(
+        "a prior weighed against the noise of one of several measurements",
+        'None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]',
+        'None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"] * data.nsample_array.max() ** 0.5',
+        ("tests/calibrate/test_calibrate_command.py", "tests/products/test_noise_level.py"),
+    ),
     Mutation("noise in each part", "noise *= std / np.sqrt(2)", "noise *= std", CORRUPTION),
     Mutation(
         "noise by the time, not its root",

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 TINY = 1e-9
 """Tolerance of the limits of a range of k, h/Mpc: a bin belongs to one range, whatever the rounding of its centre."""
+SEEN = 3.0
+"""Power above that of the noise by more than so many sigma is seen."""
 REFLECTION_WIDTH = 2
 """Reflections are searched for within this many standard deviations of their mean delay."""
 
@@ -75,7 +77,7 @@ def fraction_within(value: np.ndarray, error: np.ndarray) -> Finding:
 
 
 def rms_power(spectrum: SphericalSpectrum, used: np.ndarray) -> Finding:
-    """Return the rms of P over bins, and its uncertainty for that many independent bins."""
+    """Return the rms of P over bins, with the uncertainty of as many independent bins that are alike, as of noise."""
     value = float(np.sqrt(np.mean(spectrum.power.real[used] ** 2)))
     return Finding(value, value / np.sqrt(2 * used.sum()))
 
@@ -173,25 +175,61 @@ def _last_biased(biased: np.ndarray) -> int | None:
     return last
 
 
-def power_without_eor(run: Results, used: np.ndarray, weights: np.ndarray) -> Finding:
-    """Return a weighted mean of P^R0 over bins outside the wedge, mK^2 h^-3 Mpc^3: the residual of data without EoR.
+def _without_eor(run: Results, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return P^R0 of bins outside the wedge, its standard deviation by noise, and the rest of its error, (N,) each.
 
-    The bins are (Nk,) bool; the weights of the used bins may have any sum. Errors come from leaving out antennas
-    (`calstudy.power.score`), because power left by foregrounds is not noise. The part of them that thermal noise
-    explains is independent from bin to bin; the rest is taken as common to all bins, which share the gains. In a bin
-    with a single baseline or group, whose scatter is not known, the error is the power itself. Raises Unevaluated
+    Errors come from leaving out antennas (`calstudy.power.score`), because power left by foregrounds is not noise. In a
+    bin with a single baseline or group, whose scatter is not known, the rest is the power itself. Raises Unevaluated
     without the variants `eor` and `residual_without_eor`, or scores.
     """
     eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
     score = run.score
     if not np.array_equal(score.bin_edges, residual.bin_edges):
         raise Unevaluated("the scores of the run have other bins than its spectra")
-    share, noise = weights / np.sum(weights), residual.noise_error[used]
-    power = residual.power.real[used]
+    power, noise = residual.power.real[used], residual.noise_error[used]
     error = (score.bias_error * eor.power.real)[used] / score.flux_scale**2
-    common = np.where(np.isfinite(error), np.sqrt(np.maximum(error**2 - noise**2, 0)), np.abs(power))
-    uncertainty = np.hypot(np.sqrt(np.sum((share * noise) ** 2)), np.sum(share * common))
+    rest = np.where(np.isfinite(error), np.sqrt(np.maximum(error**2 - noise**2, 0)), np.abs(power))
+    return power, noise, rest
+
+
+def power_without_eor(run: Results, used: np.ndarray, weights: np.ndarray) -> Finding:
+    """Return a weighted mean of P^R0 over bins outside the wedge, mK^2 h^-3 Mpc^3: the residual of data without EoR.
+
+    The bins are (Nk,) bool; the weights of the used bins may have any sum. Noise is independent from bin to bin; the
+    rest of the error is taken as common to all bins, which share the gains. Raises Unevaluated as `_without_eor`.
+    """
+    power, noise, rest = _without_eor(run, used)
+    share = weights / np.sum(weights)
+    uncertainty = np.hypot(np.sqrt(np.sum((share * noise) ** 2)), np.sum(share * rest))
     return Finding(float(np.sum(share * power)), float(uncertainty))
+
+
+def _above_noise(run: Results, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `_without_eor` does, and no rest of the error in bins that are not above the noise by `SEEN` sigma.
+
+    There leaving out antennas tells the noise, which is known better.
+    """
+    power, noise, rest = _without_eor(run, used)
+    return power, noise, np.where(np.abs(power) > SEEN * noise, rest, 0)
+
+
+def rms_without_eor(run: Results, used: np.ndarray, units: np.ndarray | float = 1.0) -> Finding:
+    """Return the rms over bins of P^R0 outside the wedge, over its `units` in the bins.
+
+    The square of noise has the variance 2 sigma^4, and that of power P with noise 4 P^2 sigma^2 + 2 sigma^4, in which
+    the measured square is P^2 + sigma^2. What is left above the noise has the errors of `power_without_eor`.
+    """
+    power, noise, rest = (values / units for values in _above_noise(run, used))
+    rms = float(np.sqrt(np.mean(power**2)))
+    of_noise = max(float(np.sum(4 * power**2 * noise**2 - 2 * noise**4)), float(np.sum(2 * noise**4))) ** 0.5
+    common = float(np.sum(2 * np.abs(power) * rest))
+    return Finding(rms, float(np.hypot(of_noise, common)) / (2 * power.size * rms))
+
+
+def pull_without_eor(run: Results, used: np.ndarray) -> Finding:
+    """Return the mean over bins of P^R0 outside the wedge in units of its noise; errors as for `rms_without_eor`."""
+    power, noise, rest = _above_noise(run, used)
+    return Finding(float(np.mean(power / noise)), float(np.hypot(power.size**-0.5, np.mean(rest / noise))))
 
 
 def bias(run: Results, k_min: float, k_max: float) -> Finding:

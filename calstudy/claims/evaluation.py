@@ -39,25 +39,40 @@ class Evaluation:
     """Verdicts on the statements of papers, one for each statement.
 
     `without_role` has a sentence, with the reasons, for each paper in which a run plays no role, and which therefore
-    has no verdicts.
+    has no verdicts, and for each member of a collection whose results do not suit its role.
     """
 
     verdicts: list[Verdict]
     without_role: tuple[str, ...] = ()
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no statement was evaluated."""
+        return all(verdict.measured is None for verdict in self.verdicts)
+
 
 def evaluate_run(papers: Sequence[Paper], results: Results | PooledResults) -> Evaluation:
     """Evaluate the statements of papers on the roles that one run plays."""
-    verdicts: list[Verdict] = []
+    verdicts: dict[str, list[Verdict]] = {}
     without_role = []
     for paper in papers:
         refusals = refusals_of_run(paper, results)
         played = [role for role, refusal in refusals.items() if refusal is None]
         if played:
-            verdicts += _evaluate(paper, dict.fromkeys(played, results), only_played=True)
+            verdicts[paper.label] = _evaluate(paper, dict.fromkeys(played, results), only_played=True)
         else:
             without_role.append(_told(paper, refusals))
-    return Evaluation(verdicts, tuple(without_role))
+    return Evaluation(_of_all(verdicts), tuple(without_role))
+
+
+def _of_all(verdicts: Mapping[str, list[Verdict]]) -> list[Verdict]:
+    """Return the verdicts of all papers, by label; if there are several, sections are named with their paper."""
+    several = sum(map(bool, verdicts.values())) > 1
+    return [
+        replace(verdict, section=f"{label}: {verdict.section}") if several else verdict
+        for label, found in verdicts.items()
+        for verdict in found
+    ]
 
 
 def refusals_of_run(paper: Paper, results: Results | PooledResults) -> dict[str, str | None]:
@@ -94,7 +109,9 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, Results | Poole
     on single runs are left out.
     """
     pooled = bool(runs) and all(isinstance(run, PooledResults) for run in runs.values())
-    return Evaluation([verdict for paper in papers for verdict in _evaluate(paper, _accepted(paper, runs), pooled)])
+    verdicts = {paper.label: _evaluate(paper, _accepted(paper, runs), pooled) for paper in papers}
+    refused = [reason for paper in papers for reason in _refused(paper, runs)]
+    return Evaluation(_of_all(verdicts), tuple(refused))
 
 
 def evaluate_by_solver(
@@ -130,10 +147,20 @@ def _accepted(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> dict
     """Return the runs whose roles a paper accepts, because another paper may have a role of the same name."""
     with guarded(paper):
         return {
-            role: run
-            for role, run in runs.items()
-            if role in paper.roles and paper.refusal(role, run.experiment) is None
+            role: run for role, run in runs.items() if role in paper.roles and paper.refusal_of_run(role, run) is None
         }
+
+
+def _refused(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> list[str]:
+    """Explain why the results of runs do not suit their roles, where the settings do."""
+    found = []
+    with guarded(paper):
+        for role, run in runs.items():
+            if role in paper.roles and paper.refusal(role, run.experiment) is None:
+                refusal = paper.refusal_of_run(role, run)
+                if refusal is not None:
+                    found.append(f"{run.name} does not play the role {role} of {paper.label}: {refusal}.")
+    return found
 
 
 def _evaluate(
@@ -153,7 +180,8 @@ def _measured_on(statement: Statement, runs: Mapping[str, Any]) -> tuple[Stateme
     """Return a statement, with its measure on realizations if these play its roles, and the runs for its measure."""
     played = [runs[role] for role in statement.roles if role in runs]
     if statement.pooled and played and all(isinstance(run, PooledResults) for run in played):
-        return replace(statement, measure=statement.pooled), dict(runs)
+        quantity = f"{statement.quantity}; mean over bins and realizations, error by their scatter"
+        return replace(statement, measure=statement.pooled, quantity=quantity), dict(runs)
     return statement, {role: run for role, run in runs.items() if not isinstance(run, PooledResults)}
 
 
@@ -190,8 +218,9 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
     The folder is that of a run, or of a collection, whose members' folders are beside it. If members differ only in the
-    paper's own solver, claims-by-solver.json and .md are written too. `papers` are names or files in place of those
-    that the run names. Python files of these are always run, those of the folder's experiments only with `run_code`.
+    paper's own solver, claims-by-solver.json and .md are written too. If no statement is evaluated, nothing is written.
+    `papers` are names or files in place of those that the run names. Python files of these are always run, those of the
+    folder's experiments only with `run_code`.
     Raises InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
     """
     run = RunFolder(folder)
@@ -199,6 +228,8 @@ def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = T
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
         found, by_solver = _evaluated(run, named)
+    if found.is_empty:
+        return found
     with errors_of_files(f"{folder}: the claims cannot be written"):
         write_claims(found.verdicts, folder, run.name, run.manifest["stand_ins"], found.without_role)
         if by_solver:
@@ -309,7 +340,7 @@ def claims(
     )
 
 
-class Claims(Task, stage="claims", version=14, cost=Cost(1, disk=1e5)):
+class Claims(Task, stage="claims", version=15, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
 
     papers: Sequence[Any]

@@ -175,8 +175,9 @@ def claims(
 
     A statement is supported, contradicted or undecided by the 95 % interval of the number.
 
-    Writes claims.json and claims.md into the folder. For a collection with studies by the paper's own solver and by
-    another one, also writes claims-by-solver.json and claims-by-solver.md.
+    Writes claims.json and claims.md into the folder, but nothing if no statement can be evaluated. For a collection
+    with studies by the paper's own solver and by another one, also writes claims-by-solver.json and
+    claims-by-solver.md.
 
     Of several folders the written verdicts are shown together, and none is written: of each statement that of the last
     folder that evaluates it, so that studies with realizations come last.
@@ -202,6 +203,8 @@ def claims(
         show_verdicts(evaluated.verdicts, ", ".join(run.name for run in runs), console)
     for sentence in evaluated.without_role:
         console.print(sentence, markup=False)
+    if evaluated.is_empty:
+        console.print("No statement was evaluated; nothing was written.")
 
 
 @app.command()

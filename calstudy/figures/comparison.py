@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
-from calstudy.figures import CasesFigure
+from calstudy.figures import MOST, CasesFigure
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
 from calstudy.run.task import Job
@@ -19,6 +19,7 @@ from calstudy.verdicts.standing import SIGMAS, upper_limit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
@@ -30,6 +31,8 @@ REFERENCE = {"recovered": 1.0, "bias": 0.0}
 DECADES = {"recovered": 1.5, "bias": 0.7}
 """Length of the linear part of a logarithmic axis, in decades."""
 ROW_HEIGHT, LARGEST_K = 1.7, 1.0
+CROSS: dict[str, Any] = {"color": style.BLACK, "marker": "x", "markersize": 7, "linestyle": "", "zorder": 3}
+"""Marks cases of which most solves did not converge."""
 
 
 def look(place: int) -> dict[str, Any]:
@@ -42,6 +45,18 @@ def look(place: int) -> dict[str, Any]:
         "marker": MARKERS[(place + 3 * again) % len(MARKERS)],
         "linestyle": lines[again % len(lines)],
     }
+
+
+def is_unsettled(case: Case) -> bool:
+    """Whether most solves of a case did not converge."""
+    return case.converged < MOST
+
+
+def cross_entries(cases: Mapping[str, Mapping[str, Case]]) -> list[Line2D]:
+    """Return the entry of crosses for a legend, or none if no case has a cross."""
+    if any(is_unsettled(case) for found in cases.values() for case in found.values()):
+        return [style.entry(label="most solves did not converge", **CROSS)]
+    return []
 
 
 @style.journal_style()
@@ -198,8 +213,8 @@ def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence
     """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
 
     Colours are variants of calibrators, symbols those of worlds: the text after the last comma of a label names the
-    variant. Open symbols are 95 % upper limits of a bias that is within two standard deviations of zero; crosses are
-    cases of which most solves stalled or failed. `cases` are by world and calibrator.
+    variant. Open symbols are 95 % upper limits of a bias that is within two standard deviations of zero; crosses
+    mark cases of which most solves did not converge. `cases` are by world and calibrator.
     """
     worlds, rows = variants(list(cases)), variants(calibrators)
     shown = {
@@ -227,9 +242,9 @@ def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence
     ]
     handles += [
         style.entry(color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit"),
-        style.entry(color=style.GREY, marker="x", linestyle="", label="stalled"),
+        *cross_entries(cases),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.0)
     return figure
 
 
@@ -240,12 +255,6 @@ def _drawn(labels: Mapping[str, str], worlds: Sequence[Mapping[str, Case]]) -> b
 def is_limit(bias: float, error: float) -> bool:
     """Whether the bias is within two standard deviations of zero, so that only its upper limit is known."""
     return bool(np.isfinite(error) and abs(bias) < SIGMAS * error)
-
-
-def _stalled(case: Case) -> bool:
-    """Return True if most solves of a case stalled or failed."""
-    counts = case.summary["by_status"]
-    return 2 * (counts.get("stalled", 0) + counts.get("failed", 0)) > sum(counts.values())
 
 
 def _draw_panel(
@@ -266,14 +275,15 @@ def _draw_panel(
                 bands = cases[label].bands
                 bias, error = float(bands.bias[band]), float(bands.bias_error[band])
                 limited = is_limit(bias, error)
-                axes.plot(
+                at = (
                     upper_limit(bias, error) if limited else abs(bias),
                     row + SPREAD * ((place * len(kinds) + number + 0.5) / count - 0.5),
-                    marker="x" if _stalled(cases[label]) else markers[kind],
-                    linestyle="",
-                    color=colours[variant],
-                    markerfacecolor="white" if limited else colours[variant],
                 )
+                face = "white" if limited else colours[variant]
+                axes.plot(*at, marker=markers[kind], linestyle="", color=colours[variant], markerfacecolor=face)
+                if is_unsettled(cases[label]):
+                    # Below the symbols, so that open ones stay open.
+                    axes.plot(*at, **{**CROSS, "zorder": 1})
     axes.set_xscale("log")
     axes.set_xlim(left=LOWEST)
     axes.set_ylim(len(rows) - 0.5, -0.5)
@@ -286,13 +296,13 @@ def _draw_panel(
 class ComparisonVariants(CasesFigure):
     """Bias of calibrators in variants and in variants of worlds: of labels such as ``sky-based, autos``."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     kind: str = "comparison-variants"
     caption = (
         "Bias of every calibrator, by its variants (colours) and those of the worlds (symbols), next to the wedge and "
-        "beyond. The dashed line is the EoR; open symbols are 95 % upper limits, crosses "
-        "cases of which most solves stalled."
+        "beyond. The dashed line is the EoR; open symbols are 95 % upper limits, and crosses mark cases of which "
+        "most solves did not converge."
     )
 
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.table import number
-from calstudy.figures import MOST, CasesFigure
-from calstudy.figures.comparison import is_limit, look
+from calstudy.figures import CasesFigure
+from calstudy.figures.comparison import CROSS, cross_entries, is_limit, is_unsettled, look
 from calstudy.plotting import style
 from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.comparison import Case
@@ -81,7 +81,7 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
 
 def _stars(case: Case | None) -> str:
     """Return a star for a case of which most solves did not converge, else an empty text."""
-    return "*" if case is not None and case.converged < MOST else ""
+    return "*" if case is not None and is_unsettled(case) else ""
 
 
 def _name_columns(axes: Axes, labels: Sequence[str], width: int) -> None:
@@ -163,8 +163,6 @@ class ComparisonMatrix(CasesFigure):
 
 
 FAULT_HEIGHT = 1.7
-CROSS: dict[str, Any] = {"color": style.BLACK, "marker": "x", "markersize": 7, "linestyle": "", "zorder": 3}
-"""Over cases of which most solves did not converge."""
 LINEAR = 0.01
 """The axis of the bias is linear up to this, and logarithmic beyond."""
 ZERO = 0.3
@@ -206,10 +204,9 @@ def draw_tolerances(
     grid[0, 0].set_title(band + level, loc="left")
     scored = {name for found in cases.values() for name in found}
     looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
-    handles = {name: style.entry(linewidth=0.7, **its) for name, its in looks.items()}
-    if any(case.converged < MOST for found in cases.values() for case in found.values()):
-        handles["most solves did not converge"] = style.entry(**CROSS)
-    figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=min(len(handles), 5))
+    handles = [style.entry(label=name, linewidth=0.7, **its) for name, its in looks.items()]
+    handles += cross_entries(cases)
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5))
     return figure
 
 
@@ -231,7 +228,7 @@ def _draw_points(
     positions = _positions(fault)[there]
     bars = SIGMAS_95 * np.nan_to_num(errors)
     axes.errorbar(positions, values, yerr=bars, elinewidth=0.6, linewidth=0.7, **look(place))
-    lost = [case.converged < MOST for case in found]
+    lost = [is_unsettled(case) for case in found]
     axes.plot(positions[lost], values[lost], **CROSS)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -190,7 +190,8 @@ class ExpectedLoss:
 def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9) -> Figure:
     """Draw T outside the wedge per |k| on the left, and against the delay for some baseline lengths on the right.
 
-    Lines are expected, points measured, with 95 % bars. The wedge ends at the horizon plus `buffer`, s.
+    Lines are expected, points measured, with 95 % bars; on the right points are free of the flux scale. The wedge ends
+    at the horizon plus `buffer`, s.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 2.9)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -219,6 +220,7 @@ def _draw_lengths(axes: Axes, loss: ExpectedLoss) -> None:
     axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
     count = len(loss.map.bin_edges)
     width = max(count // 8, 1)
+    scale = loss.measured.flux_scale**2
     for place, colour in zip((0.15, 0.45, 0.75), (style.BLUE, style.GREEN, style.RED), strict=True):
         first = min(round(place * count), count - width)
         rows = slice(first, first + width)
@@ -226,8 +228,8 @@ def _draw_lengths(axes: Axes, loss: ExpectedLoss) -> None:
         inside = (loss.expected.length_edges[:, 0] >= low) & (loss.expected.length_edges[:, 1] <= high)
         axes.errorbar(
             1e9 * loss.map.delay,
-            np.mean(loss.map.transfer[rows], axis=0),
-            SIGMAS_95 * np.sqrt(np.sum(loss.map.transfer_error[rows] ** 2, axis=0)) / width,
+            scale * np.mean(loss.map.transfer[rows], axis=0),
+            scale * SIGMAS_95 * np.sqrt(np.sum(loss.map.transfer_error[rows] ** 2, axis=0)) / width,
             fmt="o",
             color=colour,
             markersize=2.2,
@@ -237,12 +239,14 @@ def _draw_lengths(axes: Axes, loss: ExpectedLoss) -> None:
         label = rf"$|\mathbf{{b}}| = {low:g}$–${high:g}$ m"
         axes.plot(1e9 * loss.expected.delay, loss.expected.by_length[inside].mean(axis=0), color=colour, label=label)
     axes.set(xlabel=style.DELAY, xlim=(0, 1e9 * min(MAX_DELAY, loss.map.delay[-1])))
-    axes.set_title("points injected, lines expected")
+    axes.set_title("points injected, free of the flux scale; lines expected")
     axes.legend(loc="lower right")
 
 
 class ExpectedLossFigure(StudyFigure):
     """The transfer function that the fit predicts, against the one measured by injection."""
+
+    version: ClassVar[int] = 2
 
     kind: str = "expected-loss"
 

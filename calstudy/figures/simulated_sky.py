@@ -84,12 +84,11 @@ class SourceCounts:
 
 def count_sources(sky: SkyModel) -> SourceCounts:
     """Count point sources in bins of equal logarithmic width; those with flat spectra at their flux density."""
-    from astropy import units
-
     from calstudy.sky.foregrounds import in_complete_area
+    from calstudy.sky.spectra import at_frequencies
 
     if sky.spectral_type != "flat":
-        sky = sky.at_frequencies(np.array([FREQUENCY]) * units.Hz, inplace=False, run_check=False)
+        sky = at_frequencies(sky, np.array([FREQUENCY]))
     flux = sky.stokes[0, 0].to_value("Jy")
     inside = in_complete_area(sky.skycoord)
     edges = np.geomspace(FAINT, BRIGHT, BINS + 1)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pyuvdata import UVBeam, UVData
-from pyuvdata.analytic_beam import AnalyticBeam, UnpolarizedAnalyticBeam
+from pyuvdata.analytic_beam import AnalyticBeam
 from scipy.ndimage import spline_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -140,8 +140,7 @@ class TurnedBeam(AnalyticBeam):
         jones = self.nominal.efield_eval(
             az_array=frame.azimuth, za_array=frame.nominal_zenith_angle, freq_array=f_grid[:, 0]
         )
-        if not isinstance(self.nominal, UnpolarizedAnalyticBeam):
-            jones = frame.to_ground(jones)
+        jones = frame.to_ground(jones)
         return jones[:, ::-1] if self.misalignment.swapped else jones
 
 

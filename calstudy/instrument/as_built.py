@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from calstudy.base.errors import InputError
-from calstudy.base.schema import Section, fault
+from calstudy.base.schema import REVISED, Section, fault
 from calstudy.base.units import Angle, Fraction, Length
 
 DIPOLES = 16
@@ -78,8 +78,7 @@ class DipoleErrors(Section):
 class BeamErrors(Section):
     """True less nominal orientation and width of the beams of antennas, of any kind of beam.
 
-    An antenna is rotated as a whole, with its polarization. The beams of unpolarized formulas (gaussian, airy) are
-    rotated without it.
+    An antenna is rotated as a whole, with its polarization.
     """
 
     pointing_scatter: Angle = Field(
@@ -117,8 +116,8 @@ class AsBuilt(Section):
     """True less nominal instrument: it is simulated, but calibrators do not know it."""
 
     positions: PositionErrors = PositionErrors()
-    dipoles: DipoleErrors = DipoleErrors()
-    beams: BeamErrors = BeamErrors()
+    dipoles: DipoleErrors = Field(DipoleErrors(), json_schema_extra={REVISED: 2})
+    beams: BeamErrors = Field(BeamErrors(), json_schema_extra={REVISED: 2})
 
     @property
     def drawn_seeds(self) -> dict[str, int]:

@@ -33,7 +33,9 @@ BELOW = np.radians(15)
 def read_beamfits(path: Path) -> UVBeam:
     """Read a beam from a beamfits file, as an E-field on a grid of azimuth and zenith angle from the zenith.
 
-    The phases of a power beam are lost: its field is the square root of the power, along the direction of the feed.
+    Frequencies ascend, azimuths ascend from east within [0, 2 pi), and components are along azimuth and zenith angle,
+    whatever the file has. Phases are those of the file, which must have the sign of `calstudy.instrument.tabulated`.
+    Those of a power beam are lost: its field is the square root of the power, along the direction of the feed.
     Raises InputError if the file is missing, cannot be read, has feeds other than x and y, or lacks a part of the sky.
     """
     if not path.is_file():
@@ -64,8 +66,6 @@ def _read(path: Path) -> UVBeam:
         raise InputError(f"instrument.beam.path: feed x of {path} is not east-west, which it must be")
     if beam.pixel_coordinate_system == "az_za":
         _require_whole_sky(beam, path)
-    if beam.beam_type == "efield" and beam.pixel_coordinate_system == "az_za":
-        return beam
     return _on_grid(beam, feeds, path)
 
 
@@ -88,20 +88,20 @@ def _feeds(beam: UVBeam) -> list[str]:
 
 
 def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
-    """Return a beam on HEALPix, or a power beam, as an E-field on a grid."""
+    """Return a beam as an E-field on a grid."""
+    is_power = beam.beam_type == "power"
     if beam.pixel_coordinate_system == "healpix":
         per_degree = -(-beam.nside // DEGREE_NSIDE)
         azimuth = np.radians(np.arange(360 * per_degree) / per_degree)
         zenith_angle = np.radians(np.arange(90 * per_degree + 1) / per_degree)
         values = HealpixRings(beam, path).on_grid(_smooth_values(beam, feeds), azimuth, zenith_angle)
+        jones = polar_components(_along_feeds(values) if is_power else values, azimuth)
     else:
-        azimuth, zenith_angle, values = beam.axis1_array, beam.axis2_array, _smooth_values(beam, feeds)
-    if beam.beam_type == "power":
-        values = np.sqrt(np.maximum(values.real, 0))
-        along = [int(feed == "y") for feed in feeds]
-        fields = np.zeros((2, *values.shape), dtype=complex)
-        fields[along, range(len(feeds))] = values
-        values = fields
+        azimuth, columns = _around(beam.axis1_array)
+        zenith_angle = beam.axis2_array
+        values = (_powers(beam, feeds) if is_power else _components(beam))[..., columns]
+        jones = polar_components(_along_feeds(values), azimuth) if is_power else values
+    order = np.argsort(beam.freq_array)
     basis = np.zeros((2, 2, len(zenith_angle), len(azimuth)))
     basis[0, 0] = basis[1, 1] = 1.0
     return UVBeam.new(
@@ -111,7 +111,7 @@ def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
         model_name=beam.model_name,
         model_version=beam.model_version,
         data_normalization="physical",
-        freq_array=beam.freq_array,
+        freq_array=beam.freq_array[order],
         feed_array=feeds,
         feed_angle=[np.pi / 2, 0.0][: len(feeds)],
         mount_type="fixed",
@@ -119,7 +119,7 @@ def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
         axis1_array=azimuth,
         axis2_array=zenith_angle,
         basis_vector_array=basis,
-        data_array=polar_components(values, azimuth),
+        data_array=jones[:, :, order],
         history=beam.history,
     )
 
@@ -127,12 +127,38 @@ def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
 def _smooth_values(beam: UVBeam, feeds: list[str]) -> np.ndarray:
     """Return power, (Nfeeds, ...), or fixed field components, (2, Nfeeds, ...), which are smooth at the zenith."""
     if beam.beam_type == "power":
-        places = [list(beam.polarization_array).index(POLARIZATIONS[feed]) for feed in feeds]
-        return beam.data_array[0, places].real.astype(complex)
+        return _powers(beam, feeds).astype(complex)
     longitude = healpy.pix2ang(beam.nside, beam.pixel_array, nest=beam.ordering == "nested")[1]
-    # Axes of the file to azimuth and zenith angle.
-    polar = np.einsum("a...p,acp->c...p", beam.data_array, beam.basis_vector_array)
-    return fixed_components(polar, longitude)
+    return fixed_components(_components(beam), longitude)
+
+
+def _powers(beam: UVBeam, feeds: list[str]) -> np.ndarray:
+    """Return the power of each feed, (Nfeeds, Nfreqs, ...)."""
+    places = [list(beam.polarization_array).index(POLARIZATIONS[feed]) for feed in feeds]
+    return beam.data_array[0, places].real
+
+
+def _components(beam: UVBeam) -> np.ndarray:
+    """Return a field's components along azimuth and zenith angle, (2, Nfeeds, Nfreqs, ...), of those along its axes."""
+    return np.einsum("afn...,ac...->cfn...", beam.data_array, beam.basis_vector_array)
+
+
+def _along_feeds(power: np.ndarray) -> np.ndarray:
+    """Return the `fixed_components` of fields along feeds x and y, or x, with powers (Nfeeds, ...)."""
+    fields = np.zeros((2, *power.shape), dtype=complex)
+    feeds = range(len(power))
+    fields[feeds, feeds] = np.sqrt(np.maximum(power.real, 0))
+    return fields
+
+
+def _around(azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return azimuths within [0, 2 pi), ascending and each one once, and their places among the given ones."""
+    nearest = np.abs(np.diff(azimuth)).min() / 1000
+    turned = azimuth % (2 * np.pi)
+    turned[turned > 2 * np.pi - nearest] = 0.0
+    places = np.argsort(turned, kind="stable")
+    places = places[np.diff(turned[places], prepend=-1.0) > nearest]
+    return turned[places], places
 
 
 class HealpixRings:

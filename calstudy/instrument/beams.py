@@ -6,18 +6,21 @@ a visibility is V_xx = ½ ∫ A I exp(2πi ν b·s/c) dΩ with b = x_b − x_a f
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pyuvdata import UVBeam
-from pyuvdata.analytic_beam import AnalyticBeam
+from pyuvdata.analytic_beam import AnalyticBeam, UnpolarizedAnalyticBeam
+from scipy.integrate import quad_vec
 from scipy.interpolate import CubicSpline
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
+from calstudy.instrument.beam_grid import polar_components
 from calstudy.instrument.interface import Beam, model_of
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.tabulated import TabulatedBeam
@@ -28,6 +31,10 @@ if TYPE_CHECKING:
 FEEDS = {"xx": 0, "yy": 1}
 ZENITH_ANGLES = np.linspace(0, np.pi / 2, 361)
 AZIMUTHS = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+HALVED = np.pi / 2 / 2 ** np.arange(1, 21)
+"""Zenith angles, rad, between which adaptive quadrature begins: no beam in closed form is narrower than the last."""
+RESOLVED = 1e-4
+"""Relative difference of solid angles on `ZENITH_ANGLES` and on every second of them, below which they are right."""
 
 TILE_DIPOLES = 4
 TILE_SPACING = 1.1
@@ -66,13 +73,34 @@ def _row_factor(wavenumber: np.ndarray) -> np.ndarray:
     return sum(np.cos(wavenumber * offset) for offset in offsets) / TILE_DIPOLES
 
 
+@dataclass(kw_only=True, eq=False)
+class FeedBeam(AnalyticBeam):
+    """A formula without polarization, with its field along the feeds (Ludwig's third definition)."""
+
+    formula: UnpolarizedAnalyticBeam
+
+    basis_vector_type = "az_za"
+
+    def _efield_eval(self, *, az_grid: np.ndarray, za_grid: np.ndarray, f_grid: np.ndarray) -> np.ndarray:
+        """Return Jones components (azimuth, zenith angle) x feeds at directions and frequencies."""
+        # pyuvdata has half of the power in each component. The same directions at all frequencies.
+        jones = self.formula.efield_eval(az_array=az_grid[0], za_array=za_grid[0], freq_array=f_grid[:, 0])
+        values, angles = jones.sum(axis=0) / np.sqrt(2), np.asarray(self.feed_angle)[:, None, None]
+        return polar_components(np.stack([np.sin(angles) * values, np.cos(angles) * values]), az_grid)
+
+
 class ExactBeam:
-    """An analytic beam, evaluated at the requested directions and frequencies (`Beam`)."""
+    """An analytic beam, evaluated at the requested directions and frequencies (`Beam`).
+
+    The field of a beam without polarization is taken to be along the feed.
+    """
 
     def __init__(self, analytic: AnalyticBeam, name: str, stand_in: str | None) -> None:
         self.name = name
         self.stand_in: str | None = stand_in
         self._analytic = analytic
+        if isinstance(analytic, UnpolarizedAnalyticBeam):
+            self._analytic = FeedBeam(formula=analytic, feed_array=analytic.feed_array, feed_angle=analytic.feed_angle)
         self._angles: dict[tuple[int, bytes], np.ndarray] = {}
 
     def at(self, frequencies: np.ndarray) -> AnalyticBeam:
@@ -84,17 +112,41 @@ class ExactBeam:
         wanted = np.asarray(frequencies, dtype=float)
         key = FEEDS[polarization], wanted.tobytes()
         if key not in self._angles:
-            self._angles[key] = np.array([self._solid_angles(frequency, key[0]) for frequency in wanted]).T
+            self._angles[key] = self._solid_angles(wanted, key[0])
         first, second = self._angles[key].copy()
         return first, second
 
-    def _solid_angles(self, frequency: float, feed: int) -> tuple[float, float]:
-        azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, ZENITH_ANGLES))
-        jones = self._analytic.efield_eval(
-            az_array=azimuth, za_array=zenith_angle, freq_array=np.array([frequency], dtype=float)
-        )
-        power = (np.abs(jones[:, feed, 0]) ** 2).sum(axis=0)
-        return integrate_power(power.reshape(len(ZENITH_ANGLES), len(AZIMUTHS)), ZENITH_ANGLES)
+    def _solid_angles(self, frequencies: np.ndarray, feed: int) -> np.ndarray:
+        """Return Ω_p and Ω_pp, (2, Nfreqs), from a grid if it resolves the beam at all frequencies."""
+        angles = []
+        for frequency in frequencies:
+            power = self._power(ZENITH_ANGLES, np.array([frequency]), feed)[0]
+            found, coarse = (np.array(integrate_power(power[::n], ZENITH_ANGLES[::n])) for n in (1, 2))
+            # Also false for a beam so narrow that both are zero.
+            if not (np.abs(found - coarse) < RESOLVED * found).all():
+                return self._adaptive_solid_angles(frequencies, feed)
+            angles.append(found)
+        return np.array(angles).T
+
+    def _adaptive_solid_angles(self, frequencies: np.ndarray, feed: int) -> np.ndarray:
+        """Return Ω_p and Ω_pp, (2, Nfreqs), by adaptive quadrature in zenith angle."""
+        # Solid angles of an aperture scale so: the tolerance is for the largest of all values.
+        scale = frequencies**-2 / frequencies[0] ** -2
+
+        def ring(zenith_angle: float) -> np.ndarray:
+            power = self._power(np.array([zenith_angle]), frequencies, feed)[:, 0]
+            means = np.array([power.mean(axis=1), (power**2).mean(axis=1)])
+            return 2 * np.pi * np.sin(zenith_angle) * means / scale
+
+        found, *_ = quad_vec(ring, 0, np.pi / 2, epsabs=0, epsrel=RESOLVED / 10, norm="max", points=HALVED)
+        return scale * found
+
+    def _power(self, zenith_angles: np.ndarray, frequencies: np.ndarray, feed: int) -> np.ndarray:
+        """Return |J|² of a feed on the rings of some zenith angles, (Nfreqs, Nza, Naz)."""
+        azimuth, zenith_angle = (grid.ravel() for grid in np.meshgrid(AZIMUTHS, zenith_angles))
+        jones = self._analytic.efield_eval(az_array=azimuth, za_array=zenith_angle, freq_array=frequencies)
+        power = (np.abs(jones[:, feed]) ** 2).sum(axis=0)
+        return power.reshape(len(frequencies), len(zenith_angles), len(AZIMUTHS))
 
 
 class GriddedBeam:

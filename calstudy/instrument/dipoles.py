@@ -18,7 +18,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.package_files import BEAM
 from calstudy.instrument.as_built import FEEDS
 from calstudy.instrument.beam_frequencies import fit_range
-from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_element, tabulate, zenith_normalized
+from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_element, tabulate
 
 
 class DipoleFields:
@@ -46,7 +46,7 @@ class DipoleFields:
         reduced = np.empty(self._reduced.shape[1:], dtype=complex)
         for feed, weights in enumerate(amplitudes):
             reduced[:, :, feed] = np.tensordot(weights, self._reduced[:, :, :, feed], axes=1)
-        return zenith_normalized(self.whole.interpolation.evaluate(reduced, frequencies))
+        return self.whole.normalized(reduced, frequencies)
 
 
 class Tile:
@@ -74,7 +74,8 @@ dipole_fields = lru_cache(maxsize=1)(DipoleFields)
 def _single_fields(path: Path, low: float, high: float) -> Iterator[np.ndarray]:
     """Yield J of each dipole, (Ntab, 2 [azimuth, zenith angle], 2 [x, y], Nza, Naz), complex.
 
-    These are the steps of `UVBeam.read_mwa_beam`, which would read all modes each time and take six times as long.
+    These are the steps of `UVBeam.read_mwa_beam`, which would read all modes each time and take six times as long. As
+    in `mwa_embedded_element`, the phases are those of the visibilities, opposite to the file's.
     """
     reader = MWABeam()
     available, feeds, dipoles, lengths = reader._read_metadata(path)
@@ -97,4 +98,4 @@ def _single_fields(path: Path, low: float, high: float) -> Iterator[np.ndarray]:
         jones = reader._get_response(
             freqs_hz=frequencies, pol_names=feeds, beam_modes=modes, phi_arr=azimuth, theta_arr=zenith_angle
         )
-        yield jones.transpose(2, 1, 0, 4, 3)
+        yield jones.transpose(2, 1, 0, 4, 3).conj()

@@ -11,7 +11,7 @@ from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, mod
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.observation import Frame
 from calstudy.base.plugins import Plugin, Registry
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.schema import REVISED, Section, choice, fault
 from calstudy.base.units import Angle, Frequency, HourAngle, Length, Time
 from calstudy.instrument.as_built import Antennas, AsBuilt, Misalignment, dipole_amplitudes, misalignments
 
@@ -113,6 +113,7 @@ class InstrumentSettings(Section):
     antenna_beams: dict[str, AntennaBeam] = Field(
         default_factory=dict,
         description="Sets of antennas with another beam, with any names. Power spectra are normalized with `beam`.",
+        json_schema_extra={REVISED: 2},
     )
     channels: Channels = Channels()
     times: Times = Times()

@@ -1,4 +1,8 @@
-"""Interpolation of tabulated beams in frequency."""
+"""Interpolation of tabulated beams in frequency.
+
+An element at d from the centre of an antenna has the phase -2 pi nu d.s / c in the direction s. That is the convention
+of the visibilities (`calstudy.instrument.beams`), in which an antenna at x_a has that phase with x_a for d.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,9 @@ from calstudy.base.errors import InputError
 from calstudy.base.kept_arrays import kept_arrays
 from calstudy.base.package_files import BEAM
 from calstudy.base.user_code import digest_file
-from calstudy.instrument import beam_frequencies
+from calstudy.instrument import beam_frequencies, beam_grid
 from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
+from calstudy.instrument.beam_grid import fixed_components
 
 PIXELS_PER_DEGREE = 1
 
@@ -50,7 +55,7 @@ def _mwa_embedded_element(path: Path, digest: str, band: tuple[float, float], in
         "file": digest,
         "band": band,
         "interpolation": interpolation,
-        "code": [digest_file(Path(source)) for source in (__file__, beam_frequencies.__file__)],
+        "code": [digest_file(Path(source)) for source in (__file__, beam_frequencies.__file__, beam_grid.__file__)],
         "libraries": {name: version(name) for name in ("h5py", "numpy", "pyuvdata", "scipy")},
     }
     fitted = kept_arrays("mwa-beam", decisive, lambda: fit_table(_read_mwa(path, band), band, interpolation))
@@ -59,11 +64,14 @@ def _mwa_embedded_element(path: Path, digest: str, band: tuple[float, float], in
 
 def _read_mwa(path: Path, band: tuple[float, float]) -> UVBeam:
     try:
-        return UVBeam.from_file(
+        beam = UVBeam.from_file(
             path, file_type="mwa_beam", pixels_per_deg=PIXELS_PER_DEGREE, freq_range=list(fit_range(band))
         )
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"instrument.beam.path: {path} cannot be read as an MWA beam file ({error})") from error
+    # Its phases are +2 pi nu d.s / c.
+    beam.data_array = beam.data_array.conj()
+    return beam
 
 
 def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> dict[str, Any]:
@@ -78,13 +86,14 @@ def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> d
     reduced = in_frequency.reduce(values)
     first, last = np.searchsorted(tabulated, band[0], side="right") - 1, np.searchsorted(tabulated, band[1])
     around = slice(first, last + 1)
-    fitted = zenith_normalized(in_frequency.evaluate(reduced, tabulated[around]))
+    azimuth = table.axis1_array[0]
+    fitted = zenith_normalized(in_frequency.evaluate(reduced, tabulated[around]), azimuth)
     return {
         "interpolation": interpolation,
         "tabulated": tabulated,
         "reduced": reduced,
         "tabulated_frequencies": tabulated[around],
-        "fit_error": float(np.abs(fitted - zenith_normalized(values[around])).max()),
+        "fit_error": float(np.abs(fitted - zenith_normalized(values[around], azimuth)).max()),
         **describe(table),
     }
 
@@ -96,8 +105,9 @@ class TabulatedBeam:
     component. Its power at large delays is at the level of rounding. "cubic", "linear" and "nearest" interpolate from
     point to point, as in the paper, and reproduce the scatter of the table.
 
-    The result is divided by its zenith value, for each feed. For these beams the zenith value is the peak. It is a
-    smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need not be.
+    The result is divided by its zenith value, for each feed (`zenith_normalized`). For these beams the zenith value is
+    the peak. It is a smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need
+    not be.
 
     Attributes
     ----------
@@ -128,7 +138,12 @@ class TabulatedBeam:
     def jones(self, frequencies: np.ndarray) -> np.ndarray:
         """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""
         frequencies = self.require_within(frequencies)
-        return zenith_normalized(self.interpolation.evaluate(self._reduced, frequencies))
+        return self.normalized(self._reduced, frequencies)
+
+    def normalized(self, reduced: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
+        """Return J from a table on the same grid that `interpolation` has reduced; see `jones`."""
+        values = self.interpolation.evaluate(reduced, frequencies)
+        return zenith_normalized(values, self.description["axis1_array"][0])
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
         """Return the E-field beam tabulated at `frequencies` in Hz, (Nfreqs,)."""
@@ -155,13 +170,16 @@ def tabulate(description: Mapping[str, Any], jones: np.ndarray, frequencies: np.
     )
 
 
-def zenith_normalized(values: np.ndarray) -> np.ndarray:
-    """Divide by the square root of the zenith power, per feed and frequency.
+def zenith_normalized(values: np.ndarray, azimuth: float) -> np.ndarray:
+    """Divide by the square root of the zenith power, and by the phase there along the feed, per feed and frequency.
 
-    Complex values (Nfreqs, 2 [azimuth, zenith angle], Nfeeds, Nza, Naz) become (2, Nfeeds, Nfreqs, Nza, Naz).
+    Complex values (Nfreqs, 2 [azimuth, zenith angle], Nfeeds, Nza, Naz) become (2, Nfeeds, Nfreqs, Nza, Naz). Feeds are
+    x and y, or x. `azimuth` is that of the first column, rad.
     """
     jones = np.moveaxis(values, 0, 2)
-    zenith = np.sqrt((np.abs(jones[..., 0, 0]) ** 2).sum(axis=0))
+    fixed = fixed_components(jones[..., 0, 0], np.array(azimuth))
+    feeds = range(fixed.shape[1])
+    zenith = np.sqrt((np.abs(fixed) ** 2).sum(axis=0)) * np.exp(1j * np.angle(fixed[feeds, feeds]))
     return jones / zenith[None, :, :, None, None]
 
 

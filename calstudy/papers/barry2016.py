@@ -55,7 +55,7 @@ def incomplete_model_contaminates_window(run: Results) -> Finding:
 
 @MISSING.states(
     "it can be used only if the calibration model is unrealistically accurate",
-    "the same with the complete sky model",
+    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc, with the complete sky model",
     AtMost(1, sigmas=2),
     "less than the EoR itself, so that it can be measured",
     roles=("complete_sky_model",),
@@ -66,7 +66,7 @@ def complete_model_leaves_window_clean(run: Results) -> Finding:
 
 @MISSING.states(
     f"{JOINT}: gains of smooth antennas can be smoothed, which removes what sources that are missing leave",
-    "the same with sources missing and smoothed gains",
+    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc, with sources missing and smoothed gains",
     AtMost(1, sigmas=2),
     "less than the EoR itself, so that it can be measured",
     roles=("smooth_antennas",),
@@ -77,7 +77,8 @@ def smooth_antennas_leave_window_clean(run: Results) -> Finding:
 
 @MISSING.states(
     f"{JOINT}: smoothing fails if antennas have structure at the delays of the window",
-    "the same with such antennas",
+    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc, with sources missing, smoothed gains and antennas with "
+    "such structure",
     AtLeast(1, sigmas=2),
     "the EoR cannot be measured below a bias of its own size",
     roles=("structured_antennas",),

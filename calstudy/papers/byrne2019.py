@@ -41,7 +41,7 @@ def absolute_calibration_overwhelms_eor(run: Results) -> Finding:
 
 @MISSING.states(
     "the errors come from the sky model",
-    "the same with the complete sky model",
+    "s² P^R0 / P^S outside the wedge, k of 0.1 to 0.2 h/Mpc, redundant calibration with the complete sky model",
     AtMost(1, sigmas=2),
     "less than the EoR itself: with the complete model there are no such errors",
     roles=("redundant_complete",),

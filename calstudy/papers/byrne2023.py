@@ -71,7 +71,7 @@ class Byrne2023(Paper):
     roles: ClassVar[Mapping[str, str]] = {
         "sky_based": "a run of sky-based calibration whose sky model lacks sources, with inverse variances as weights "
         "or gains that are smooth in frequency",
-        "delay_weighted": "a run of delay-weighted calibration with the same sky model",
+        "delay_weighted": "a run of delay-weighted calibration whose sky model lacks sources",
     }
     usual_members: ClassVar[Mapping[str, str]] = {
         "sky_based": "long-sky-based-incomplete",

@@ -44,7 +44,7 @@ def leakage_exceeds_signal_thousandfold(run: Results) -> Finding:
 
 @DEFORMED.states(
     "with the beams of all tiles in the calibration, the leakage is less than the signal",
-    "the same with the true beams in the sky model",
+    "s² P^R0 / P^S outside the wedge, k of 0.1 to 1 h/Mpc, with the true beams in the sky model",
     AtMost(1, sigmas=2),
     "less than the EoR itself",
     roles=("all_beams",),
@@ -65,7 +65,7 @@ class Chokshi2024(Paper):
     roles: ClassVar[Mapping[str, str]] = {
         "one_beam": "a run of sky-based calibration of tiles with unequal dipoles, unknown to its model, with inverse "
         "variances as weights or gains that are smooth in frequency",
-        "all_beams": "the same with the dipoles in calibration.assumed",
+        "all_beams": "a run of sky-based calibration of tiles with unequal dipoles, with these in calibration.assumed",
     }
     usual_members: ClassVar[Mapping[str, str]] = {
         "one_beam": "long-deformed-beams",

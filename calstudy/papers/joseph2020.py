@@ -41,7 +41,7 @@ def bias_is_a_hundred_signals(run: Results) -> Finding:
 
 @DEAD.states(
     "this is above the expected signal",
-    "the same",
+    "s² P^R0 / P^S outside the wedge, k of 0.1 to 1 h/Mpc",
     AtLeast(1, sigmas=2),
     "above it at all, beyond the errors",
 )

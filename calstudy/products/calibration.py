@@ -14,7 +14,7 @@ from calstudy.base.observation import Observation
 from calstudy.base.resources import COMPLEX64, COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.calibrate.execution import cost_of, run_calibrator
 from calstudy.calibrate.interface import Assumed, Calibrator
-from calstudy.calibrate.records import SETTLED, CalibrationResult, Solve
+from calstudy.calibrate.records import SETTLED, USABLE, CalibrationResult, Solve
 from calstudy.calibrate.sky_model import common_baselines
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
@@ -223,8 +223,17 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
         "where solves stall, results depend on where they start: T is not determined better than by the spread of two "
         "starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not depend on them"
     ]
-    return (stalled if "stalled" in by_status else []) + [
-        f"{len(unconverged)} of {len(records)} solves did not converge "
-        f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
-        f"{example['integration']}: {example['message']}"
+    lost = sum(record["status"] not in USABLE for record in records) / len(records)
+    without = [
+        f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost: errors by the noise of spectra "
+        "of simulations count them, and are too small by as much"
     ]
+    return (
+        (stalled if "stalled" in by_status else [])
+        + (without if 0 < lost < 1 else [])
+        + [
+            f"{len(unconverged)} of {len(records)} solves did not converge "
+            f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
+            f"{example['integration']}: {example['message']}"
+        ]
+    )

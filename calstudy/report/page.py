@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -58,7 +59,7 @@ def read_charts(path: Path) -> list[Chart]:
     """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.style`); none for other arrays.
 
     An entry ``GROUP.FIELD`` is a field of a spectrum: `power` over `k`, a transfer function over `k`, or either over
-    `k_perp` and `k_parallel`.
+    `k_perp` and `k_parallel`. Items of lists, which have numbers for names, are left out.
     """
     groups: dict[str, dict[str, np.ndarray]] = {}
     with np.load(path, allow_pickle=False) as arrays:
@@ -68,18 +69,24 @@ def read_charts(path: Path) -> list[Chart]:
     return [chart for chart in (*_spectra(groups), _transfer(groups), _maps(groups)) if chart is not None]
 
 
+def _is_named(series: str) -> bool:
+    """Return whether a series is no item of a list, nor a part of one."""
+    return not any(part.isdigit() for part in series.split("."))
+
+
 def _spectra(groups: Mapping[str, Mapping[str, np.ndarray]]) -> list[Chart]:
     """Return a chart for each column of spherical power spectra."""
     columns: dict[str, dict[str, Any]] = {}
     for name, fields in groups.items():
         column, _, series = name.rpartition(".")
-        if {"k", "power", "noise_error", "sample_error"} <= fields.keys():
+        if _is_named(series) and {"k", "power", "noise_error", "sample_error"} <= fields.keys():
             error = fields["noise_error"] + fields["sample_error"]
             columns.setdefault(column, {})[series] = (fields["k"], fields["power"].real, error)
-    charts = []
+    titles = {column: str(groups.get(column, {}).get("title", np.array(""))) for column in columns}
+    counts, charts = Counter(titles.values()), []
     for column, found in columns.items():
-        title = str(groups.get(column, {}).get("title", np.array("")))
-        charts.append(_curves(f"Power spectra, {title}" if title else "Power spectra", POWER, True, found))
+        parts = [titles[column], column.replace("_", " ") if counts[titles[column]] > 1 else ""]
+        charts.append(_curves(", ".join(["Power spectra", *filter(None, parts)]), POWER, True, found))
     return charts
 
 
@@ -88,7 +95,7 @@ def _transfer(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
     found = {
         name: (fields["k"], fields["scale_free_transfer"], fields["scale_free_transfer_error"])
         for name, fields in groups.items()
-        if {"k", "scale_free_transfer", "scale_free_transfer_error"} <= fields.keys()
+        if _is_named(name) and {"k", "scale_free_transfer", "scale_free_transfer_error"} <= fields.keys()
     }
     return _curves("T, free of the flux scale", "T", False, found) if found else None
 
@@ -117,7 +124,7 @@ def _maps(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
     """Return the chart of cylindrical spectra, or of a cylindrical transfer function."""
     series: list[dict[str, Any]] = []
     logarithmic, label = True, POWER
-    for name in [*SERIES, *(name for name in groups if name not in SERIES)]:
+    for name in [*SERIES, *(name for name in groups if name not in SERIES and _is_named(name))]:
         fields = groups.get(name, {})
         quantity = "power" if "power" in fields else "transfer"
         if not {"k_perp", "k_parallel", "horizon_delay", "delay", quantity} <= fields.keys():

@@ -113,7 +113,7 @@ class SplinePattern:
         azimuth, self._zenith_angle = beam.axis1_array, beam.axis2_array
         step = azimuth[1] - azimuth[0]
         pad = AZIMUTH_EXTENSION if np.isclose(abs(azimuth[-1] - azimuth[0]) + step, 2 * np.pi, atol=step) else 0
-        self._azimuth = azimuth[0] + step * np.arange(-pad, len(azimuth) + pad)
+        self._azimuth, self._least = azimuth[0] + step * np.arange(-pad, len(azimuth) + pad), azimuth.min()
         data = beam.data_array[:, [list(beam.feed_array).index(feed) for feed in feeds]]
         data = np.pad(data, [(0, 0)] * 4 + [(pad, pad)], mode="wrap") if pad else data
         n_axes, n_feeds, n_freqs = data.shape[:3]
@@ -137,6 +137,7 @@ class SplinePattern:
         """Return real and imaginary parts of both components of J, (Ndirections, Nfeeds, Nfreqs, 4)."""
         table = self._table.reshape(*self._table.shape[:2], -1)
         fields = np.empty((len(azimuth), table.shape[2]))
+        azimuth = (azimuth - self._least) % (2 * np.pi) + self._least
         rows, columns = cells(zenith_angle, self._zenith_angle), cells(azimuth, self._azimuth)
         spline_fields(table, *rows, *columns, fields)
         return fields.reshape(len(azimuth), *self._table.shape[2:])

@@ -18,6 +18,7 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import use_bundled_earth_orientation
 from calstudy.simulate.nodes import EARTH_ROTATION_RATE, chebyshev_count, chebyshev_nodes, interpolation_matrix
+from calstudy.sky.spectra import at_frequencies
 
 
 def is_polarized(sky: SkyModel) -> bool:
@@ -37,7 +38,7 @@ def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | sl
     InputError if a spectral index is not a number, or the sky lacks one of the frequencies.
     """
     if sky.spectral_type == "subband":
-        sky = sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False)
+        sky = at_frequencies(sky, frequencies)
     spectrum = _stokes_values(sky, frequencies, components) * _jansky_factor(sky, frequencies, components)
     return np.broadcast_to(spectrum, (len(frequencies), spectrum.shape[1]))
 

@@ -171,7 +171,7 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     """Read point sources from a CSV file with a header line; rows without a position or flux density are left out.
 
     The columns are right ascension and declination (ICRS, degrees), flux density (Jy) and spectral index. Raises
-    ValueError if a column is missing or not numeric, or a selected source has no spectral index.
+    ValueError if a column is missing or not numeric, there is no source, or a source has no spectral index.
     """
     table = Table.read(path, format="ascii.csv")
     wanted = {key: getattr(columns, key) for key in ("right_ascension", "declination", "flux", "spectral_index")}
@@ -183,6 +183,8 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
         key: np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan) for key, name in named.items()
     }
     usable = np.isfinite([values[key] for key in ("right_ascension", "declination", "flux")]).all(axis=0)
+    if not usable.any():
+        raise ValueError("it holds no source: no row has a position and a flux density; give at least one such row")
     values = {key: column[usable] for key, column in values.items()}
     spectrum: dict[str, Any] = {"spectral_type": "flat"}
     if "spectral_index" in values:

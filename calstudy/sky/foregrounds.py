@@ -35,6 +35,7 @@ from calstudy.sky.catalogue import (
 )
 from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL_INDEX, draw_population
 from calstudy.sky.eor import draw_harmonics
+from calstudy.sky.spectra import at_frequencies, require_enclosed, span
 
 HASLAM_FREQUENCY = 408e6
 # The map is in tenths of a kelvin, on a grid of 20 arcmin in B1950 coordinates, its middle at (0, 0).
@@ -136,9 +137,7 @@ def add_skies(points: SkyModel, diffuse: SkyModel, frequencies: np.ndarray) -> S
             "reference_frequency": np.concatenate([_reference_frequency(points), diffuse.reference_frequency]),
         }
     else:
-        points, diffuse = (
-            sky.at_frequencies(frequencies * units.Hz, inplace=False, run_check=False) for sky in (points, diffuse)
-        )
+        points, diffuse = (at_frequencies(sky, frequencies) for sky in (points, diffuse))
         spectra = {"spectral_type": "full", "freq_array": frequencies * units.Hz}
     directions = [sky.skycoord.icrs for sky in (points, diffuse)]
     longitude, latitude = (np.concatenate([getattr(one, axis).rad for one in directions]) for axis in ("ra", "dec"))
@@ -317,10 +316,14 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
             f"sky.foregrounds.path: {lacking.sum()} sources of {settings.path} have no spectral index, such as "
             f"{sky.name[lacking][0]}; give all of them one, or leave out the column"
         )
+    flat = settings.spectrum == "flat"
+    wanted = f"{'the middle of ' if flat else ''}the channels of {span(frequencies)}"
+    needed = np.mean(frequencies, keepdims=True) if flat else frequencies
+    require_enclosed(sky, needed, f"sky.foregrounds.path: {settings.path}", wanted)
     at_centre = _at_frequency(sky, float(np.mean(frequencies)))
     flux = at_centre.stokes[0, 0].to_value("Jy")
     flux = np.where(np.isfinite(flux), flux, -np.inf)
-    if settings.spectrum == "flat":
+    if flat:
         # All channels have the flux of the catalogue at the middle of the band.
         sky = SkyModel(
             name=sky.name,
@@ -349,7 +352,12 @@ def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregr
         raise InputError(f"sky.foregrounds: {where} must return a pyradiosky SkyModel of points")
     if sky.spectral_type == "full" and not _has_frequencies(sky, frequencies):
         raise InputError(f"sky.foregrounds: {where} tabulates fluxes at frequencies other than the channels")
-    sky.check()
+    try:
+        sky.check()
+        sky = _in_jansky(sky)
+    except ValueError as error:
+        raise InputError(f"sky.foregrounds: the sky that {where} returns cannot be used ({error})") from error
+    require_enclosed(sky, frequencies, f"sky.foregrounds: {where}", f"the channels of {span(frequencies)}")
     flux = _at_frequency(sky, float(np.mean(frequencies))).stokes[0, 0].to_value("Jy")
     order = np.argsort(-flux, kind="stable")
     stand_in = f"foregrounds: {sky.Ncomponents} sources by {where}"
@@ -363,9 +371,7 @@ def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:
     if sky.spectral_type == "full":
         tabulated = sky.freq_array.to_value("Hz")
         frequency = tabulated[np.abs(tabulated - frequency).argmin()]
-    # Cubic interpolation between sub-bands, the default, needs four of them.
-    kind = "linear" if sky.spectral_type == "subband" and sky.Nfreqs < 4 else "cubic"
-    return sky.at_frequencies(np.array([frequency]) * units.Hz, inplace=False, freq_interp_kind=kind)
+    return at_frequencies(sky, np.array([frequency]))
 
 
 def _has_frequencies(sky: SkyModel, frequencies: np.ndarray) -> bool:
@@ -422,5 +428,10 @@ def _read(settings: section.FileSources) -> SkyModel:
         if settings.csv is not None:
             return read_csv_catalogue(path, settings.csv)
         return _in_jansky(SkyModel.from_file(str(path)))
+    except IndexError as error:
+        # pyradiosky looks at the first source also where there is none.
+        raise InputError(
+            f"sky.foregrounds.path: {path} holds no source, or is damaged ({error}); give a catalogue of one or more"
+        ) from error
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"sky.foregrounds.path: {path} cannot be read as a catalogue ({error})") from error

@@ -220,8 +220,8 @@ def _readme(manifest: Manifest, template: UVData, file_format: str) -> str:
         phase="The telescope drifts: data are not phased." if file_format == "uvh5" else phased,
         noise="The data have no noise."
         if manifest.noise is None
-        else f"The standard deviation of the complex noise of a measurement is {manifest.noise:.6g} Jy; where gains make "
-        "samples differ, its inverse square is the mean of their inverse variances.",
+        else f"The standard deviation of the complex noise of a measurement is {manifest.noise:.6g} Jy; where gains "
+        "make samples differ, its inverse square is the mean of their inverse variances.",
     )
 
 

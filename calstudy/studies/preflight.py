@@ -45,6 +45,7 @@ def require_possible(experiment: Experiment) -> None:
     require_beams(experiment.instrument)
     _require_small_errors(experiment.instrument)
     _require_eor(experiment.sky.eor, experiment.instrument)
+    _require_catalogue(experiment)
     require_usable(experiment.corruption.effects, size_of_instrument(experiment.instrument))
     numbers = make_array(experiment.instrument).numbers
     require_antennas(experiment.power, numbers, "give other numbers in instrument.layout.path")
@@ -65,6 +66,18 @@ def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
         from calstudy.sky.eor import read_power_table
 
         read_power_table(eor.path)
+
+
+def _require_catalogue(experiment: Experiment) -> None:
+    """Raise InputError if a file of sources, of the data or assumed, cannot be used for the channels."""
+    channels = experiment.instrument.channels
+    if isinstance(experiment.sky.foregrounds, FileSources):
+        _kept(experiment.sky.foregrounds, channels)
+    if isinstance(other := assumed_world(experiment).sky.foregrounds, FileSources):
+        try:
+            _kept(other, channels)
+        except InputError as error:
+            raise InputError(f"{FIELD}.{error}") from None
 
 
 def require_fine_maps(eor: Eor, lengths: np.ndarray, band: tuple[float, float], field: str) -> None:

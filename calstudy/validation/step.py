@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from calstudy.base.files import json_number
 from calstudy.base.plugins import Registry, guarded
 from calstudy.base.resources import Cost
 from calstudy.base.schema import UNKEYED
+from calstudy.claims.bins import clustered_mean
 from calstudy.claims.paper import Paper
 from calstudy.corrupt.levels import Levels
 from calstudy.experiment.model import Experiment
@@ -184,6 +185,18 @@ def only(runs: Mapping[str, StepInput]) -> StepInput:
     """Return the input of the single experiment of a step."""
     (run,) = runs.values()
     return run
+
+
+def largest(values: Iterable[float]) -> float:
+    """Return the largest of some numbers, NaN if one of them is NaN, so that it cannot pass."""
+    return float(np.max(list(values)))
+
+
+def mean_over(values: np.ndarray, used: np.ndarray) -> Finding:
+    """Return `clustered_mean` over the modes used, (Nunits, Nmodes) bool; NaN if one of them is not finite."""
+    if not np.isfinite(values[used]).all():
+        return Finding(math.nan, math.nan)
+    return clustered_mean(np.where(used, values, np.nan))
 
 
 def required(task: Task | None, what: str) -> Task:

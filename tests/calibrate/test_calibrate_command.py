@@ -13,6 +13,7 @@ from contextlib import redirect_stderr, redirect_stdout
 import numpy as np
 import pytest
 from filelock import FileLock
+from observations import with_autos
 from pyuvdata import UVCal, UVData, UVFlag
 from toy import make_toy, scattered
 from toy_data import make_uvdata
@@ -175,6 +176,25 @@ def test_the_size_of_the_errors_of_the_sky_model_is_told(command, finished, data
     assert code == 0, error
     (found,) = re.findall(r"errors of the sky model: ([0-9.]+) % of its rms on each baseline", error)
     assert 5 < float(found) < 20
+
+
+@pytest.mark.chain
+def test_samples_of_many_measurements_have_the_noise_of_all_of_them(command, finished, data, tmp_path):
+    """Nine measurements of a second each have the noise of one of nine seconds."""
+    sky = UVData.from_file(str(finished[0] / "out" / "model.uvh5"))
+    sky.data_array *= 1 + 0.1 * (sky.baseline_array % 2)[:, None, None]
+    sky.write_uvh5(str(tmp_path / "sky.uvh5"))
+    measured = with_autos(UVData.from_file(str(data)), power=30.0)
+    found = {}
+    for name, counts in (("once", 1), ("often", 9)):
+        measured.nsample_array[:] = counts
+        measured.integration_time[:] = 9.0 / counts
+        measured.write_uvh5(str(tmp_path / f"{name}.uvh5"))
+        block = ["--set", "calibrator=delay-weighted", "--select", "times=0..0", "--output", name]
+        assert command(f"{name}.uvh5", *block, "--sky-model", "sky.uvh5", "--no-gain-errors")[0] == 0
+        found[name] = read_gains(tmp_path / name / "gains.calh5", "test").gain_array
+    # The fits stop at a tolerance of 1e-5.
+    assert found["often"] == pytest.approx(found["once"], rel=1e-5)
 
 
 def test_the_log_tells_every_solve(finished):

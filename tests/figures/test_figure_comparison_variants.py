@@ -1,4 +1,4 @@
-"""The figure of variants: what is measured, what is a limit and what stalled must look different."""
+"""The figure of variants: what is measured, what is a limit and what did not converge must look different."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 from flat_scores import case
 
-from calstudy.figures.comparison import VARIANT_COLOURS, draw_variants, variants
+from calstudy.figures.comparison import CROSS, VARIANT_COLOURS, draw_variants, variants
+from calstudy.plotting import style
 from calstudy.verdicts.standing import upper_limit
 
 
@@ -39,11 +40,36 @@ def test_symbols_say_what_was_measured(figure):
     panel = figure.axes[0]
     points = {(line.get_marker(), line.get_color()): line for line in panel.lines if line.get_linestyle() == "None"}
     equal, gains = VARIANT_COLOURS[:2]
-    assert set(points) == {("o", equal), ("x", equal), ("o", gains), ("s", gains)}
+    assert set(points) == {("o", equal), ("s", equal), ("x", style.BLACK), ("o", gains), ("s", gains)}
     assert points["o", equal].get_xdata()[0] == 10.0
     assert points["o", equal].get_markerfacecolor() == equal
     assert points["o", gains].get_xdata()[0] == upper_limit(0.1, 0.1)
     assert points["o", gains].get_markerfacecolor() == "white"
+
+
+@pytest.mark.parametrize("bias_error", [1.0, 8.0])
+@pytest.mark.parametrize(
+    ("solves", "crossed"),
+    [
+        ({"converged": 2, "max-steps": 2}, False),
+        ({"converged": 1, "max-steps": 3}, True),
+        ({"converged": 1, "stalled": 1, "failed": 2}, True),
+    ],
+)
+def test_a_cross_is_below_the_symbol_of_a_case_of_which_most_solves_did_not_converge(bias_error, solves, crossed):
+    good = with_status(case(bias=10.0, bias_error=1.0), converged=4)
+    other = with_status(case(bias=10.0, bias_error=bias_error), **solves)
+    figure = draw_variants({"one, white": {"fit": good}, "one, smooth": {"fit": other}}, ["fit"])
+    _, symbol, *crosses = (line for line in figure.axes[0].lines if line.get_linestyle() == "None")
+    assert symbol.get_marker() == "s"
+    assert symbol.get_markerfacecolor() == ("white" if bias_error == 8.0 else VARIANT_COLOURS[0])
+    at = [list(cross.get_xydata()[0]) for cross in crosses]
+    assert at == crossed * [list(symbol.get_xydata()[0])]
+    assert all(cross.get_marker() == CROSS["marker"] for cross in crosses)
+    assert all(symbol.get_markersize() < cross.get_markersize() for cross in crosses)
+    assert all(symbol.get_zorder() > cross.get_zorder() for cross in crosses)
+    labels = [text.get_text() for text in figure.legends[0].texts]
+    assert labels[3:] == ["95 % upper limit", *(["most solves did not converge"] if crossed else [])]
 
 
 def test_symbols_of_worlds_are_those_of_the_legend_and_none_is_left_out():

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calstudy.figures.signal_loss import SignalLoss, draw_signal_loss
+from calstudy.figures.signal_loss import ExpectedLoss, SignalLoss, draw_expected_loss, draw_signal_loss
 from calstudy.figures.sweep import SweepPanel, draw_sweep
 from calstudy.plotting.style import figure_arrays
-from calstudy.power.transfer import TransferFunction, TransferMap
+from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
 
 
 def function(transfer: list[float], edges: list[float], error: float = 0.02) -> TransferFunction:
@@ -110,6 +110,28 @@ def test_axes_have_units(loss):
     # Of the part of the residual that the EoR makes, not of all of it.
     assert left.get_ylabel() == "$T = P^{D}/P^{S}$"
     assert "Mpc" in right.get_xlabel()
+
+
+def test_points_per_length_are_free_of_the_flux_scale_as_are_the_expected_lines(loss):
+    outside, found = loss.outside, loss.map
+    expected = ExpectedBins(
+        k=outside.k,
+        bin_edges=outside.bin_edges,
+        outside=outside.transfer,
+        outside_error=outside.transfer_error,
+        length_edges=found.bin_edges,
+        delay=found.delay,
+        by_length=1.02**2 * found.transfer,
+    )
+    right = draw_expected_loss(ExpectedLoss(expected, outside, found)).axes[1]
+    assert "free of the flux scale" in right.get_title()
+    lines = [line for line in right.lines if str(line.get_label()).startswith("$")]
+    for row, (line, container) in enumerate(zip(lines, right.containers, strict=True)):
+        points, _, (drawn,) = container.lines
+        assert points.get_ydata() == pytest.approx(1.02**2 * found.transfer[row])
+        assert line.get_ydata() == pytest.approx(points.get_ydata())
+        halves = np.array([np.ptp(segment[:, 1]) / 2 for segment in drawn.get_segments()])
+        assert halves == pytest.approx(1.96 * 1.02**2 * found.transfer_error[row], rel=1e-3)
 
 
 def test_no_transfer_at_all_is_refused(loss):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mwa_pb import beam_full_EE, config
 from pydantic import ValidationError
-from pyuvdata import UVBeam
-from pyuvdata.analytic_beam import AiryBeam, ShortDipoleBeam
+from pyuvdata import UVBeam, analytic_beam
+from pyuvdata.analytic_beam import ShortDipoleBeam
 from scipy.constants import speed_of_light
 from scipy.stats import binom
 
@@ -19,11 +19,14 @@ from calstudy.instrument import as_built as section
 from calstudy.instrument.antenna_beams import MisalignedBeam, make_beams
 from calstudy.instrument.as_built import Misalignment, dipole_amplitudes, misalignments, position_offsets
 from calstudy.instrument.beam_frequencies import MWA_GROUP
+from calstudy.instrument.beam_models.formulas import AiryBeam, GaussianBeam
 from calstudy.instrument.beams import ExactBeam, MwaTile, make_beam
-from calstudy.instrument.dipoles import dipole_fields
+from calstudy.instrument.dipoles import Tile, dipole_fields
 from calstudy.instrument.interface import AntennaBeams
 from calstudy.instrument.settings import InstrumentSettings, assigned_beams
 from calstudy.instrument.telescope import make_template
+from calstudy.simulate.patterns import power_pattern
+from calstudy.simulate.source_sums import PairSums
 
 FREQUENCY = np.array([183.04e6])
 """A tabulated one, in Hz: no interpolation takes part in comparisons."""
@@ -87,6 +90,17 @@ def test_nothing_differs_by_default():
     )
 
 
+def test_only_arrays_of_several_beams_have_a_new_version():
+    def revised(**fields):
+        return "revised" in str(identity(instrument(**fields)))
+
+    assert not revised(as_built={"positions": {"scatter": "1 cm"}})
+    assert not revised(beam="short-dipole")
+    assert revised(as_built={"dipoles": {"dead_tiles": "30 %"}})
+    assert revised(as_built={"beams": {"swapped": [3]}})
+    assert revised(antenna_beams={"other": {"antennas": [1], "beam": "gaussian"}})
+
+
 def test_antennas_are_where_they_are_built():
     settings = instrument(as_built={"positions": {"scatter": "5 cm"}})
     built, nominal = make_template(settings, as_built=True), make_template(settings)
@@ -119,9 +133,10 @@ def tiles(beam_file):
 
 @pytest.mark.chain
 def test_tiles_with_dead_dipoles_are_those_of_mwa_pb(tiles, monkeypatch):
-    """The observatory's own code. Its azimuth is north through east, so its azimuth component has the other sign.
+    """The observatory's own code, with phases of the other sign, as the file has them.
 
-    It fails at the zenith with this numpy: that is left out, and beams are compared relative to their first direction.
+    Its azimuth is north through east, so its azimuth component has the other sign. It fails at the zenith with this
+    numpy: that is left out, and beams are compared relative to a component in their first direction.
     """
     # Names that mwa_pb uses and that h5py and numpy have dropped.
     monkeypatch.setattr(h5py.Dataset, "value", property(lambda data: data[()]), raising=False)
@@ -138,26 +153,56 @@ def test_tiles_with_dead_dipoles_are_those_of_mwa_pb(tiles, monkeypatch):
         found = beams.beams[beams.index[antenna]].at(FREQUENCY).data_array[:, :, 0, degrees[:, 1], degrees[:, 0]]
         tile = beam_full_EE.Beam(model, np.zeros((2, 16)), amps=amplitudes[antenna])
         by_feed = tile.get_response((np.pi / 2 - azimuth) % (2 * np.pi), zenith_angle)
-        expected = np.stack([-by_feed[:, 1], by_feed[:, 0]])
-        scales = [np.sqrt((np.abs(jones[:, :, :1]) ** 2).sum(axis=0)) for jones in (found, expected)]
+        expected = np.stack([-by_feed[:, 1], by_feed[:, 0]]).conj()
+        # At this azimuth most of feed x is along the zenith angle, and of feed y along the azimuth.
+        scales = [jones[[1, 0], [0, 1], :1] for jones in (found, expected)]
         np.testing.assert_allclose(found / scales[0], expected / scales[1], atol=1e-9)
     whole = make_beam(instrument().beam, instrument().channels).at(FREQUENCY).data_array
     assert np.abs(whole[:, 0, 0, degrees[:, 1], degrees[:, 0]] - found[:, 0]).max() > 0.01
 
 
+def phases_across_the_zenith(beams, position):
+    """Phase between visibilities of two sources, 5 degrees to both sides of the zenith along the dipole, (2 [x, y],).
+
+    The first antenna is at the origin and has the first beam; the second is at `position` (m) and has the last.
+    """
+    patterns = [power_pattern(beam.at(FREQUENCY), FREQUENCY, ["x", "y"]) for beam in beams]
+    delays = np.array([np.zeros(3), position]) / speed_of_light
+    pair = np.array([0]), np.array([1])
+    sums = PairSums(delays, pair, FREQUENCY, patterns, np.array([0, len(beams) - 1]), np.float64)
+
+    def visibility(azimuth, feed):
+        up, along = np.cos(np.radians(5)), np.sin(np.radians(5))
+        source = np.array([along * np.cos(np.radians(azimuth)), along * np.sin(np.radians(azimuth)), up])
+        # Fringes are relative to the centre, here the zenith.
+        return sums.at(source[:, None], np.array([0.0, 0.0, 1.0]), np.ones((1, 1)))[0, feed, 0]
+
+    return [
+        np.angle(visibility(azimuth, feed) / visibility(azimuth + 180, feed)) for feed, azimuth in ((0, 0), (1, 90))
+    ]
+
+
 def test_a_dipole_is_where_its_number_says(beam_file):
-    """The phase of a dipole's own field, across the zenith along the dipole, is that of its place in the tile.
+    """A tile with one live dipole has the fringes of a tile that stands at the place of the dipole.
 
     Neighbours along a dipole's axis hardly move the centre of its field; those beside it move it a lot.
     """
     fields = dipole_fields(beam_file, instrument().channels.band, "nearest")
-    degrees, wavenumber = 5, 2 * np.pi * FREQUENCY[0] / speed_of_light
     for dipole in range(16):
-        jones = fields.combined(np.tile(np.arange(16) == dipole, (2, 1)), FREQUENCY)[1, :, 0, degrees]
-        phase = [np.angle(-jones[feed, azimuth] / jones[feed, azimuth + 180]) for feed, azimuth in ((0, 0), (1, 90))]
-        place = np.array(phase) / (2 * wavenumber * np.sin(np.radians(degrees)))
         row, column = divmod(dipole, 4)
-        assert place == pytest.approx([1.1 * column - 1.65, 1.65 - 1.1 * row], rel=0.07)
+        place = np.array([1.1 * column - 1.65, 1.65 - 1.1 * row, 0.0])
+        alone = Tile(fields, np.tile(np.arange(16) == dipole, (2, 1)))
+        found = phases_across_the_zenith([fields.whole, alone], np.zeros(3))
+        assert found == pytest.approx(phases_across_the_zenith([fields.whole], place), rel=0.07)
+
+
+def test_tiles_have_no_phase_at_the_zenith(tiles):
+    """The field at the zenith along the feed, in the column at azimuth 0, where north is along the azimuth."""
+    for beam in tiles[1].beams:
+        zenith = beam.at(FREQUENCY).data_array[:, :, 0, 0, 0]
+        along = zenith[[1, 0], [0, 1]]
+        assert along.real == pytest.approx(1, abs=1e-3)
+        assert along.imag == pytest.approx(0, abs=1e-12)
 
 
 def test_alike_tiles_share_a_beam():
@@ -227,17 +272,38 @@ def test_a_swapped_antenna_has_the_other_dipole_on_each_feed(nominal):
         np.testing.assert_allclose(np.moveaxis(found, 1, 0), expected, atol=1e-10)
 
 
-def test_an_unpolarized_beam_is_moved_as_a_whole():
+def test_a_formula_without_polarization_has_its_field_along_the_feed():
+    """Its response with a real dipole near the zenith is one at all azimuths; pyuvdata's goes through all values."""
+    azimuth, zenith_angle = np.radians(np.arange(0, 360, 15.0)), np.full(24, np.radians(0.1))
+    points = {"az_array": azimuth, "za_array": zenith_angle, "freq_array": FREQUENCY}
+    dipole = ShortDipoleBeam().efield_eval(**points)
+    for formula in (GaussianBeam(kind="gaussian"), AiryBeam(kind="airy")):
+        found = make_beam(formula).at(FREQUENCY).efield_eval(**points)
+        np.testing.assert_allclose((found * dipole.conj()).sum(axis=0), 1, atol=1e-3)
+        # The other feed is across.
+        np.testing.assert_allclose((found * dipole[:, ::-1].conj()).sum(axis=0), 0, atol=1e-3)
+    plain = analytic_beam.AiryBeam(diameter=4.0).efield_eval(**points)
+    assert np.ptp((plain * dipole.conj()).sum(axis=0).real) > 1.9
+
+
+def test_a_formula_is_moved_as_a_whole():
+    """The offset from the antenna's own axis gives the field, and a rotation of the antenna turns it."""
     azimuth, zenith_angle = directions()
-    airy = ExactBeam(AiryBeam(diameter=14.0), "", None)
-    moved = MisalignedBeam(airy, Misalignment(east=0.03, north=0.04, width=1.1))
+    airy = ExactBeam(analytic_beam.AiryBeam(diameter=14.0), "", None)
+    moved = MisalignedBeam(airy, Misalignment(east=0.03, north=0.04, rotation=0.3, width=1.1))
     axis = np.array([np.sin(0.05) * 0.6, np.sin(0.05) * 0.8, np.cos(0.05)])
     sine = np.sin(zenith_angle)
     offset = np.arccos(axis @ [sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(zenith_angle)])
-    nominal = AiryBeam(diameter=14.0).efield_eval(
+    nominal = analytic_beam.AiryBeam(diameter=14.0).efield_eval(
         az_array=azimuth, za_array=np.minimum(offset / 1.1, np.pi / 2), freq_array=FREQUENCY
     )
-    np.testing.assert_allclose(evaluate(moved), nominal[:, :, 0], atol=1e-9)
+    power = (np.abs(evaluate(moved)) ** 2).sum(axis=0)
+    np.testing.assert_allclose(power, (np.abs(nominal[:, :, 0]) ** 2).sum(axis=0), atol=1e-9)
+    turned = evaluate(MisalignedBeam(airy, Misalignment(rotation=0.3)))
+    along, across = (turned * evaluate(airy)).sum(axis=0), (turned * evaluate(airy)[:, ::-1]).sum(axis=0)
+    total = (evaluate(airy) ** 2).sum(axis=0)
+    np.testing.assert_allclose(along, np.cos(0.3) * total, atol=1e-9)
+    np.testing.assert_allclose(across, np.outer([np.sin(0.3), -np.sin(0.3)], np.ones(len(azimuth))) * total, atol=1e-9)
 
 
 def test_tables_are_turned_like_formulas():
@@ -266,7 +332,7 @@ def test_tables_are_turned_like_formulas():
 
 
 def test_no_misalignment_changes_nothing():
-    for nominal in (MwaTile(), AiryBeam(diameter=14.0)):
+    for nominal in (MwaTile(), analytic_beam.AiryBeam(diameter=14.0)):
         same = evaluate(MisalignedBeam(ExactBeam(nominal, "", None), Misalignment()))
         np.testing.assert_allclose(same, evaluate(ExactBeam(nominal, "", None)), atol=1e-12)
 

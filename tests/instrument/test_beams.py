@@ -11,6 +11,7 @@ import pytest
 from pyuvdata import BeamInterface, UVBeam
 from pyuvdata.analytic_beam import ShortDipoleBeam
 from scipy.constants import speed_of_light
+from scipy.integrate import quad
 from scipy.signal.windows import blackmanharris
 from scipy.special import j1
 
@@ -18,10 +19,13 @@ from calstudy.base.errors import InputError
 from calstudy.base.package_files import BEAM
 from calstudy.instrument import settings as section
 from calstudy.instrument import tabulated
+from calstudy.instrument.antenna_beams import MisalignedBeam
+from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beam_frequencies import mwa_frequencies
 from calstudy.instrument.beam_models.formulas import AiryBeam, DipoleBeam, GaussianBeam, MwaAnalyticBeam
 from calstudy.instrument.beam_models.tables import HERA_FILES, FileBeam, HeraBeam, MwaEmbeddedBeam
-from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, MwaTile, integrate_power, make_beam
+from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, ExactBeam, MwaTile, integrate_power, make_beam
+from calstudy.simulate.patterns import power_pattern
 
 CHANNELS = 167.075e6 + 320e3 * np.arange(96)
 BAND = np.array([167.075e6, 182e6, 197.715e6])
@@ -67,6 +71,32 @@ def test_solid_angles_of_a_narrow_gaussian():
     squared = (np.deg2rad(3.0) ** 2 / np.log(2)) * (182e6 / BAND) ** 2
     np.testing.assert_allclose(omega_p, np.pi * squared * (1 - squared / 6), rtol=1e-5)
     np.testing.assert_allclose(omega_pp, np.pi * squared / 2 * (1 - squared / 12), rtol=1e-5)
+
+
+@pytest.mark.parametrize("fwhm", [0.01, 0.3, 6.0])
+def test_solid_angles_of_gaussians_much_narrower_than_a_degree(fwhm):
+    """2π ∫exp(−kθ²/s²) sin θ dθ, k = 1 and 2, by quadrature out to 12 s."""
+    beam = make_beam(GaussianBeam(kind="gaussian", fwhm_deg=fwhm))
+    width = np.deg2rad(fwhm / 2) / np.sqrt(np.log(2)) * 182e6 / BAND
+
+    def ring(angle, power, scale):
+        return 2 * np.pi * np.sin(angle) * np.exp(-power * (angle / scale) ** 2)
+
+    for power, found in enumerate(beam.solid_angles(BAND, "xx"), start=1):
+        expected = [quad(ring, 0, 12 * scale, args=(power, scale))[0] for scale in width]
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("diameter", [25, 300])
+def test_solid_angles_of_large_dishes(diameter):
+    """The Airy disk on an even grid of 200 points in the narrowest sidelobe, or more."""
+    beam = make_beam(AiryBeam(kind="airy", diameter=f"{diameter} m"))
+    angle = np.linspace(1e-12, np.pi / 2, 200_001)
+    argument = np.pi * diameter * np.sin(angle) * BAND[1] / speed_of_light
+    values = (2 * j1(argument) / argument) ** 2
+    for power, found in enumerate(beam.solid_angles(BAND[1:2], "xx"), start=1):
+        expected = 2 * np.pi * np.trapezoid(np.sin(angle) * values**power, angle)
+        assert found[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_gaussian_width_is_the_power_fwhm_and_shrinks_with_frequency():
@@ -271,6 +301,50 @@ def test_beamfits_round_trip(tmp_path, embedded):
     np.testing.assert_allclose(beam.at(BAND).data_array, embedded.at(BAND).data_array, atol=3e-5)
     assert "beam.beamfits" in beam.stand_in
     np.testing.assert_allclose(beam.solid_angles(BAND, "yy"), embedded.solid_angles(BAND, "yy"), rtol=1e-4)
+
+
+ROUND = np.radians(np.arange(0.0, 360.0, 2.0))
+
+
+def oblique(table):
+    """Give the components of a table along axes that are turned by 30 degrees from azimuth and zenith angle."""
+    cosine, sine = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    turn = np.array([[cosine, sine], [-sine, cosine]])
+    table.data_array = np.einsum("ac,c...->a...", turn, table.data_array)
+    table.basis_vector_array = np.broadcast_to(turn[:, :, None, None], table.basis_vector_array.shape).copy()
+
+
+def descending(table):
+    table.freq_array, table.data_array = table.freq_array[::-1].copy(), table.data_array[:, :, ::-1].copy()
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "change"),
+    [
+        (ROUND - np.pi, None),
+        (ROUND + np.radians(1), None),
+        (np.append(ROUND, 2 * np.pi), None),
+        (ROUND, oblique),
+        (ROUND, descending),
+    ],
+    ids=["from -180 deg", "from 1 deg", "0 and 360 deg", "oblique axes", "descending frequencies"],
+)
+def test_the_order_and_axes_of_a_file_do_not_matter(tmp_path, azimuth, change):
+    """A tile that is tilted, so that no two azimuths are alike, against its formula."""
+    tile = MisalignedBeam(ExactBeam(MwaTile(), "tile", None), Misalignment(east=0.1, north=0.03)).at(EVEN)
+    table = tile.to_uvbeam(freq_array=EVEN, axis1_array=azimuth, axis2_array=np.radians(np.arange(0, 91.0)))
+    if change is not None:
+        change(table)
+    table.write_beamfits(tmp_path / "beam.beamfits")
+    beam = make_beam(FileBeam(kind="beamfits", path=tmp_path / "beam.beamfits", interpolation="linear"))
+    # Around, and between the last azimuths and the first.
+    angles, zenith_angle = np.radians([10.0, 100, 179.5, 190, 260, 300, 359.5]), np.radians(8.0)
+    points = angles, np.full(len(angles), zenith_angle)
+    fields = power_pattern(beam.at(EVEN), EVEN, ["x", "y"]).fields(*points)
+    found = fields.view(np.complex128).transpose(3, 1, 2, 0)
+    expected = tile.efield_eval(az_array=points[0], za_array=points[1], freq_array=EVEN)
+    zenith = tile.efield_eval(az_array=np.zeros(1), za_array=np.zeros(1), freq_array=EVEN)
+    np.testing.assert_allclose(found, expected / np.sqrt((zenith**2).sum(axis=0)), atol=2e-4)
 
 
 @pytest.mark.parametrize("part", [{"axis2_inds": np.arange(30)}, {"axis1_inds": np.arange(180)}])

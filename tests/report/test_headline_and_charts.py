@@ -147,3 +147,27 @@ def test_maps_are_the_arrays_of_the_figure(tmp_path):
 def test_arrays_of_another_kind_have_no_charts(tmp_path):
     np.savez(tmp_path / "gains.npz", frequencies=np.arange(4.0), gains=np.ones((2, 4)))
     assert read_charts(tmp_path / "gains.npz") == []
+
+
+def test_charts_of_one_title_have_the_names_of_their_groups(tmp_path):
+    """Two solvers for one array, and another array."""
+    titles = {"paper_solver": "Redundant", "other_solver": "Redundant", "alone": "Minimally redundant"}
+    fields = dict.fromkeys(("k", "power", "noise_error", "sample_error"), np.ones(2))
+    arrays = {f"{group}.residual.{name}": value for group in titles for name, value in fields.items()}
+    np.savez(tmp_path / "solvers.npz", **arrays, **{f"{group}.title": title for group, title in titles.items()})
+    assert [chart.title for chart in read_charts(tmp_path / "solvers.npz")] == [
+        "Power spectra, Redundant, paper solver",
+        "Power spectra, Redundant, other solver",
+        "Power spectra, Minimally redundant",
+    ]
+
+
+def test_series_without_names_are_not_drawn(tmp_path):
+    """The points of a sweep are items of a list; beside one that has a name."""
+    fields = dict.fromkeys(("k", "scale_free_transfer", "scale_free_transfer_error"), np.ones(2))
+    sweep = {f"panels.0.transfers.{place}.{name}": value for place in range(3) for name, value in fields.items()}
+    np.savez(tmp_path / "sweep.npz", **sweep)
+    assert read_charts(tmp_path / "sweep.npz") == []
+    np.savez(tmp_path / "sweep.npz", **sweep, **{f"outside.{name}": value for name, value in fields.items()})
+    (chart,) = read_charts(tmp_path / "sweep.npz")
+    assert [one["label"] for one in chart.data["series"]] == ["outside the wedge"]

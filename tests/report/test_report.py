@@ -89,6 +89,18 @@ def test_figures_are_in_the_page_as_they_are_in_the_folder(folder):
     assert page.words.index("wedge: The <wedge>.") < page.words.index("spherical") < page.words.index("zebra")
 
 
+def test_curves_say_what_their_bars_are_and_maps_have_none(folder):
+    """Pictures may have 95 % bars."""
+    curve = dict.fromkeys(("k", "power", "noise_error", "sample_error"), np.ones(2))
+    np.savez(folder / "figures" / "zebra.npz", **{f"excised.residual.{name}": item for name, item in curve.items()})
+    cube = dict.fromkeys(("k_perp", "k_parallel", "baseline_length", "horizon_delay", "delay"), np.ones(2))
+    arrays = {f"residual.{name}": item for name, item in {**cube, "power": np.ones((2, 2))}.items()}
+    np.savez(folder / "figures" / "wedge.npz", **arrays)
+    words = page_of(folder).words
+    assert "Power spectra (bars: 1 σ)" in words
+    assert "Cylindrical power spectra{" in words
+
+
 def test_captions_and_their_order_are_those_of_the_manifest(folder):
     captions = {"zebra": "Stripes & all.", "wedge": "", "gone": "Not drawn."}
     (folder / "manifest.json").write_text(json.dumps({**MANIFEST, "captions": captions}))

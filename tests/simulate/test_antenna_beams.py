@@ -69,7 +69,8 @@ def test_cross_hands_of_different_beams_go_to_an_engine_that_has_them(sky, beams
     crossed = observe(count=6, channels=1, times=1)
     crossed.polarization_array = np.array([-7, -8])
     expected = PyuvsimEngine().simulate(sky, beams, crossed)
-    assert relative_error(expected[..., 0], expected[..., 1]) > 0.1
+    # The feeds are not confused: the two cross-hands differ by far more than the engines.
+    assert relative_error(expected[..., 0], expected[..., 1]) > 1e-3
     assert relative_error(MatvisEngine().simulate(sky, beams, crossed), expected) < 1e-10
     assert "confuses" in FftvisEngine().refusal(sky, beams, crossed)
     assert SimulationSettings().engine.choose(sky, beams, crossed).label == "matvis"

@@ -127,6 +127,17 @@ def test_a_swapped_dipole_correlates_with_the_other_dipole(engine, dipole_beam):
         np.testing.assert_allclose(found[pairs.index(pair)], [xx / 2, yy / 2], atol=1e-9)
 
 
+def test_swapped_feeds_of_a_formula_see_across(gaussian_beam):
+    """Near the zenith, fields of the other feed are across: the visibilities of one swapped antenna nearly vanish."""
+    template = observe(count=3, channels=1, times=1)
+    sky = point_sky(local_coordinates(template, np.radians(89.0), np.radians(20.0)), [1.0])
+    swapped = MisalignedBeam(gaussian_beam, Misalignment(swapped=True))
+    beams = AntennaBeams((gaussian_beam, swapped), np.array([0, 0, 1]))
+    found, alike = (np.abs(DenseEngine().simulate(sky, beam, template))[0, :, 0] for beam in (beams, gaussian_beam))
+    one_swapped = (beams.index[antenna_indices(template)].sum(axis=1) == 1)[:, None]
+    np.testing.assert_allclose(found, np.where(one_swapped, 0, alike), atol=1e-6)
+
+
 def test_a_misaligned_table_goes_to_all_engines(embedded_beam):
     template = observe(count=3, channels=1, times=1)
     sky = random_sky(template, count=30)

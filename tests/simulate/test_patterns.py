@@ -42,6 +42,16 @@ def test_tabulated_beam_equals_pyuvdata(embedded_beam, directions):
     np.testing.assert_allclose(only_y.at(azimuth, zenith_angle), expected[1:], rtol=0, atol=1e-13)
 
 
+def test_a_table_may_start_at_any_azimuth(embedded_beam, directions):
+    tabulated = embedded_beam.at(FREQUENCIES)
+    expected = power_pattern(tabulated, FREQUENCIES, ["x"]).at(*directions)
+    shifted = tabulated.copy()
+    shifted.axis1_array = tabulated.axis1_array - np.pi
+    shifted.data_array = np.roll(tabulated.data_array, 180, axis=-1)
+    found = power_pattern(shifted, FREQUENCIES, ["x"]).at(*directions)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
 def test_analytic_beam_is_evaluated_at_every_direction_and_frequency(tile_beam, directions):
     azimuth, zenith_angle = directions
     pattern = power_pattern(tile_beam.at(FREQUENCIES), FREQUENCIES, ["y"]).at(azimuth, zenith_angle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,16 @@ from astropy.table import Table
 from pydantic import ValidationError
 from pyradiosky import SkyModel
 from scipy.integrate import quad
+from tiny import tiny
 
 from calstudy.base.errors import InputError
+from calstudy.experiment.files import override, validate
+from calstudy.simulate.sources import stokes_i
 from calstudy.sky import catalogue
 from calstudy.sky import settings as section
 from calstudy.sky.counts import differential_counts
 from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.studies.preflight import require_possible
 
 FREQUENCIES = 167.075e6 + 80e3 * np.arange(384)
 
@@ -161,23 +166,135 @@ def test_skyh5_catalogue_with_spectral_indices(tmp_path):
 
 def test_catalogue_at_other_frequencies_is_refused(tmp_path):
     path = tmp_path / "sky.skyh5"
-    stokes = np.zeros((4, 2, 1)) * units.Jy
-    stokes[0] = 1 * units.Jy
-    sky = SkyModel(
-        name=["a"],
-        skycoord=SkyCoord([10], [-30], unit="deg", frame="icrs"),
-        stokes=stokes,
-        component_type="point",
-        spectral_type="subband",
-        freq_array=np.array([100e6, 190e6]) * units.Hz,
-        freq_edge_array=np.array([[80e6, 120e6], [120e6, 220e6]]) * units.Hz,
-    )
-    sky.write_skyh5(path)
-    assert make_foregrounds(section.FileSources(kind="file", path=path), FREQUENCIES).sky.spectral_type == "flat"
     full = point_sky({"spectral_type": "full", "freq_array": np.array([150e6]) * units.Hz})
-    full.write_skyh5(path, clobber=True)
+    full.write_skyh5(path)
     with pytest.raises(InputError, match="frequencies other than the channels"):
         make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES)
+
+
+def sub_bands(centres, spectrum):
+    """Two points whose fluxes in sub-bands are a polynomial of the frequency in units of 100 MHz, and half of it."""
+    stokes = np.zeros((4, len(centres), 2))
+    stokes[0] = np.polynomial.Polynomial(spectrum)(np.array(centres) / 100e6)[:, None] * [1, 0.5]
+    return SkyModel(
+        name=["a", "b"],
+        skycoord=SkyCoord([10, 20], [-30, -40], unit="deg", frame="icrs"),
+        stokes=stokes * units.Jy,
+        component_type="point",
+        spectral_type="subband",
+        freq_array=np.array(centres) * units.Hz,
+        freq_edge_array=(np.array([[-1e6], [1e6]]) + centres) * units.Hz,
+    )
+
+
+@pytest.mark.parametrize("diffuse", [None, section.SyntheticDiffuse(kind="synthetic", nside=16)])
+@pytest.mark.parametrize(
+    ("centres", "spectrum"),
+    [
+        ([150e6, 200e6], [2.0, -0.5]),
+        ([120e6, 150e6, 200e6], [2.0, -0.5]),
+        ([110e6, 140e6, 180e6, 220e6], [9.0, -8.0, 3.0, -0.5]),
+    ],
+)
+def test_sub_bands_are_interpolated_by_the_highest_order_that_they_allow(tmp_path, centres, spectrum, diffuse):
+    """A line from two or three of them, a cubic from four; a point alone and beside a map."""
+    path = tmp_path / "sky.skyh5"
+    sub_bands(centres, spectrum).write_skyh5(path)
+    expected = np.polynomial.Polynomial(spectrum)(FREQUENCIES / 100e6)
+    kept = make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES, diffuse)
+    np.testing.assert_allclose(stokes_i(kept.sky, FREQUENCIES)[:, :2], expected[:, None] * [1, 0.5], rtol=1e-11)
+    flat = make_foregrounds(section.FileSources(kind="file", path=path), FREQUENCIES).sky
+    centre = np.polynomial.Polynomial(spectrum)(FREQUENCIES.mean() / 100e6)
+    np.testing.assert_allclose(flux(flat), centre * np.array([1, 0.5]), rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("centres", "span"),
+    [
+        ([70e6, 150e6], "70 to 150 MHz"),
+        ([70e6, 100e6, 130e6, 150e6], "70 to 150 MHz"),
+        ([200e6, 230e6], "200 to 230 MHz"),
+        ([FREQUENCIES.mean()], "182.395 MHz"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("spectrum", "wanted"), [("flat", "the middle of the channels"), ("catalogue", "the channels")]
+)
+def test_sub_bands_that_do_not_enclose_the_channels_are_refused(tmp_path, centres, span, spectrum, wanted):
+    path = tmp_path / "sky.skyh5"
+    sub_bands(centres, [1.0]).write_skyh5(path)
+    sentence = f"has sub-bands centred at {span}, which do not enclose {wanted} of 167.075 to 197.715 MHz; "
+    with pytest.raises(InputError, match=re.escape(f"sky.foregrounds.path: {path} {sentence}")):
+        make_foregrounds(section.FileSources(kind="file", path=path, spectrum=spectrum), FREQUENCIES)
+
+
+@pytest.mark.parametrize("place", ["sky.foregrounds", "calibration.assumed.sky.foregrounds"])
+def test_plans_refuse_sub_bands_that_do_not_enclose_the_channels(tmp_path, place):
+    sub_bands([70e6, 150e6], [1.0]).write_skyh5(tmp_path / "sky.skyh5")
+    settings = override(tiny(tmp_path), place, {"kind": "file", "path": str(tmp_path / "sky.skyh5")})
+    with pytest.raises(InputError, match=f"^{place}.path: .* do not enclose the middle of the channels"):
+        require_possible(validate(settings, tmp_path))
+
+
+def test_sub_bands_about_the_middle_of_the_channels_are_enough_for_flat_spectra(tmp_path):
+    path = tmp_path / "sky.skyh5"
+    sub_bands([100e6, 190e6], [1.0]).write_skyh5(path)
+    assert flux(make_foregrounds(section.FileSources(kind="file", path=path), FREQUENCIES).sky) == pytest.approx(
+        [1, 0.5]
+    )
+    with pytest.raises(InputError, match="do not enclose the channels"):
+        make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES)
+
+
+def test_a_sky_that_is_no_catalogue_is_refused_at_frequencies_that_it_lacks():
+    sentence = "the sky has sub-bands centred at 150 to 180 MHz, which do not enclose 167.075 to 197.715 MHz; "
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        stokes_i(sub_bands([150e6, 180e6], [1.0]), FREQUENCIES)
+
+
+OWN_SKY = """
+import numpy as np
+from astropy import units
+from astropy.coordinates import SkyCoord
+from pyradiosky import SkyModel
+
+def sky(frequencies, kind, unit):
+    stokes = np.zeros((4, 2 if kind == "subband" else 1, 2))
+    stokes[0] = [2.0, 1.0]
+    found = {
+        "flat": {},
+        "spectral_index": {"spectral_index": [-0.8, 0.5], "reference_frequency": [150, 200] * units.MHz},
+        "subband": {
+            "freq_array": [160e6, 200e6] * units.Hz, "freq_edge_array": [[150e6, 190e6], [170e6, 210e6]] * units.Hz
+        },
+    }
+    points = SkyCoord([10, 20], [-30, -40], unit="deg", frame="icrs")
+    return SkyModel(
+        name=["a", "b"], skycoord=points, stokes=stokes * units.Unit(unit), spectral_type=kind, **found[kind]
+    )
+"""
+
+
+def own_sky(folder, **options):
+    (folder / "sky.py").write_text(OWN_SKY)
+    return section.CodeSources(kind="code", path=folder / "sky.py", function="sky", options=options)
+
+
+def test_points_of_own_code_in_kelvin_have_their_flux(tmp_path):
+    """S = 2 k T ν² Ω / c² at the reference frequency of each."""
+    sky = make_foregrounds(own_sky(tmp_path, kind="spectral_index", unit="K sr"), FREQUENCIES).sky
+    boltzmann, light = 1.380649e-23, 299792458.0
+    at_reference = 2e26 * boltzmann * np.array([2.0 * 150e6**2, 1.0 * 200e6**2]) / light**2
+    assert dict(zip(sky.name, flux(sky), strict=True)) == pytest.approx(dict(zip("ab", at_reference, strict=True)))
+
+
+def test_skies_of_own_code_that_cannot_be_used_are_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=r"sky\.foregrounds: .* sky of sky\.py .* reference_frequency or freq_array must"
+    ):
+        make_foregrounds(own_sky(tmp_path, kind="flat", unit="K sr"), FREQUENCIES)
+    with pytest.raises(InputError, match=r"sky of sky\.py has sub-bands centred at 160 to 200 MHz, .* 150 to 190 MHz;"):
+        make_foregrounds(own_sky(tmp_path, kind="subband", unit="Jy"), np.array([150e6, 190e6]))
 
 
 COLUMNS = {"table": "", "id": "GLEAM", "right_ascension": "RAJ2000", "declination": "DEJ2000", "flux": "Fintwide"}
@@ -192,7 +309,8 @@ def test_unusable_catalogues_are_refused(tmp_path, name):
         make_foregrounds(section.FileSources.model_validate(settings), FREQUENCIES)
 
 
-def test_any_votable_is_read_by_the_columns_named(tmp_path):
+def votable_of_two(path, rows):
+    """Write a VOTable of some of two sources, and return the settings that read it."""
     table = Table(
         {
             "source": ["a", "b"],
@@ -201,12 +319,15 @@ def test_any_votable_is_read_by_the_columns_named(tmp_path):
             "s": [2.0, 1.0] * units.Jy,
         }
     )
-    votable = from_table(table)
+    votable = from_table(table[:rows])
     votable.resources[0].tables[0].name = "survey"
-    votable.to_xml(str(tmp_path / "mine.vot"))
+    votable.to_xml(str(path))
     columns = {"table": "survey", "id": "source", "right_ascension": "ra", "declination": "dec", "flux": "s"}
-    settings = {"kind": "file", "path": tmp_path / "mine.vot", "votable": columns}
-    sky = make_foregrounds(section.FileSources.model_validate(settings), FREQUENCIES).sky
+    return section.FileSources.model_validate({"kind": "file", "path": path, "votable": columns})
+
+
+def test_any_votable_is_read_by_the_columns_named(tmp_path):
+    sky = make_foregrounds(votable_of_two(tmp_path / "mine.vot", 2), FREQUENCIES).sky
     assert flux(sky) == pytest.approx([2.0, 1.0])
     assert sky.skycoord.icrs.ra.deg == pytest.approx([10.0, 20.0])
 
@@ -235,6 +356,20 @@ def test_a_csv_is_read_by_the_columns_named(tmp_path):
         make_foregrounds(section.FileSources(kind="file", path=path, csv={**CSV, "flux": "flux"}), FREQUENCIES)
     with pytest.raises(ValidationError, match="required for CSV files"):
         section.FileSources(kind="file", path=path)
+
+
+@pytest.mark.parametrize("rows", ["", "10.0,-30.0,,0.0\n10.0,,1.0,0.0\n"])
+@pytest.mark.parametrize("columns", [CSV, {**CSV, "spectral_index": "alpha"}])
+def test_a_csv_without_a_source_is_refused(tmp_path, rows, columns):
+    path = tmp_path / "mine.csv"
+    path.write_text("ra,dec,s,alpha\n" + rows)
+    with pytest.raises(InputError, match=r"^sky\.foregrounds\.path: .*mine\.csv .*it holds no source"):
+        make_foregrounds(section.FileSources(kind="file", path=path, csv=columns), FREQUENCIES)
+
+
+def test_a_votable_without_a_source_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"^sky\.foregrounds\.path: .*mine\.vot holds no source"):
+        make_foregrounds(votable_of_two(tmp_path / "mine.vot", 0), FREQUENCIES)
 
 
 def test_points_in_kelvin_have_their_flux(tmp_path):

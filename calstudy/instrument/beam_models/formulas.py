@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from pydantic import Field
 
@@ -12,6 +14,8 @@ from calstudy.instrument.settings import Channels
 
 class AiryBeam(BeamModel):
     """The beam of a uniformly illuminated circular aperture."""
+
+    version: ClassVar[int] = 2
 
     kind: str = "airy"
     # No aperture is larger, and the beam of one would hardly have a source in it. So also for the width of a Gaussian.
@@ -30,6 +34,8 @@ class AiryBeam(BeamModel):
 
 class GaussianBeam(BeamModel):
     """A Gaussian power beam whose width scales with wavelength."""
+
+    version: ClassVar[int] = 2
 
     kind: str = "gaussian"
     fwhm_deg: float = Field(22.0, ge=0.01, lt=180, description="Full width at half maximum of the power beam, degrees.")

@@ -58,8 +58,11 @@ class _BeamfitsBeam(_TabulatedBeam, ABC):
 class FileBeam(_BeamfitsBeam):
     """A beam from a beamfits file, on a grid of azimuth and zenith angle or on HEALPix.
 
-    It should be an E-field: the field of a power beam is taken to be its square root, along the direction of the feed.
+    It should be an E-field, whose phase in the direction s is -2 pi nu d.s / c for an element at d: fields for
+    exp(+i omega t) must be conjugated. The field of a power beam is its square root, along the direction of the feed.
     """
+
+    version: ClassVar[int] = 2
 
     kind: str = "beamfits"
     path: Path = Field(strict=False)
@@ -74,7 +77,7 @@ class HeraBeam(_BeamfitsBeam):
     `fagnoni` is tabulated every 4 MHz from 100 to 200 MHz, on HEALPix of nside 32 (in the package hera_pspec).
     `nic-cst` is tabulated every 15 MHz from 100 to 145 MHz, on a grid of one degree (in pyuvsim). Between these
     frequencies both are smooth fits, without the structure that reflections in the dish cause at delays beyond some
-    100 ns.
+    100 ns. Phases are those of the files; they matter only where antennas have different beams.
     """
 
     kind: str = "hera"

@@ -40,7 +40,8 @@ def gains_within_20_percent_raw(run: Results) -> Finding:
 
 @RESULTS.states(
     GAINS,
-    "rms over antennas of the transform of g - ĝ over that of g (Blackman-Harris); median of delays",
+    "rms over antennas of the transform of g - ĝ over that of g (Blackman-Harris), free of phase and scale that no fit "
+    "can know; median of delays",
     AtMost(0.2),
     "≲ 20 %",
 )
@@ -50,7 +51,8 @@ def gains_within_20_percent_at_typical_delay(run: Results) -> Finding:
 
 @RESULTS.states(
     GAINS,
-    "rms over antennas of the transform of g - ĝ over that of g, at the worst delay",
+    "rms over antennas of the transform of g - ĝ over that of g, free of phase and scale that no fit can know; at the "
+    "worst delay",
     AtMost(0.2),
     "≲ 20 % on all delays",
 )

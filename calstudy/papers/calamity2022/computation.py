@@ -25,6 +25,10 @@ THOUSANDS_OF_ANTENNAS = 3000
 HOURS = AtMost(86_400)
 HOURS_WHY = "less than a day"
 AROUND_HUNDRED = 100
+FASTER = 30
+"""The paper's factor between CPU and GPU."""
+CORES = 4
+"""Cores of the paper's CPU, two with two each."""
 HALF_ORDER = 10**0.5
 
 
@@ -149,13 +153,14 @@ def thousands_of_steps_to_one_percent(run: RunTimeTable) -> Finding:
 
 @COMPUTATION.states(
     "CALAMITY performs ≳ 30 times faster on a GPU than on a CPU on arrays with hundreds of antennas",
-    "median time of the paper's step on one core over that on the GPU, largest array",
-    AtLeast(30),
+    "median time of the paper's step on the paper's CPU of four cores over that on the GPU, largest array; by that on "
+    "one core, which is one to four times as long",
+    AtLeast(FASTER),
     "the paper's factor",
 )
 def gpu_thirty_times_faster(run: RunTimeTable) -> Finding:
-    on_gpu = run.medians("rows", "paper-step", "gpu")[-1]
-    return Finding(float(run.medians("rows", "paper-step")[-1] / on_gpu), 0.0)
+    on_one = float(run.medians("rows", "paper-step")[-1] / run.medians("rows", "paper-step", "gpu")[-1])
+    return Finding(on_one, 0.0, "at most") if on_one < FASTER else Finding(on_one / CORES, 0.0, "at least")
 
 
 @COMPUTATION.states(

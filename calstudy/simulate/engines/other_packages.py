@@ -289,11 +289,13 @@ def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
     from astropy import units
     from pyuvsim.simsetup import SkyModelData
 
+    from calstudy.sky.spectra import interpolation_of
+
     # These are pyuvsim's steps at the start of a parallel run. They are in place, so a copy is made.
     sky = sky.copy()
     without_frequency = sky.spectral_type == "flat" and sky.reference_frequency is None and sky.freq_array is None
     if sky.spectral_type not in ("flat", "full") or (sky.component_type == "healpix" and without_frequency):
-        sky.at_frequencies(frequencies * units.Hz)
+        sky.at_frequencies(frequencies * units.Hz, freq_interp_kind=interpolation_of(sky))
     if sky.component_type == "healpix":
         sky.healpix_to_point()
     return SkyModelData(sky)

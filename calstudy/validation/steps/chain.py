@@ -51,7 +51,7 @@ from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.files import DATA, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Findings, Limit, Step, StepInput, required
+from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Findings, Limit, Step, StepInput, largest, required
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
 
 SIGMAS = 2
@@ -63,6 +63,7 @@ class EndToEnd(Step):
     """The fraction of the bins of every experiment with a pull within two sigma, for both definitions of sigma."""
 
     kind: str = "end-to-end"
+    version: ClassVar[int] = 2
     number = "4.0"
     proves = "P^R recovers P^S outside wedge and buffer, on both arrays"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
@@ -92,7 +93,8 @@ class EndToEnd(Step):
         values, remarks = {}, []
         for name, run in runs.items():
             residual, signal = (run.spherical(variant, "outside-wedge") for variant in ("residual", "eor"))
-            used = used_bins(residual, signal)
+            # A bin without a number in the residual is a miss.
+            used = used_bins(signal)
             difference = (residual.power - signal.power).real[used]
             for reading, error in (("bars", residual.error), ("difference", residual.difference_error)):
                 within = np.abs(difference / error[used]) <= SIGMAS
@@ -139,6 +141,7 @@ class SignalLossBudget(Step):
     """The largest pull of any band of k, for every experiment."""
 
     kind: str = "signal-loss-budget"
+    version: ClassVar[int] = 2
     number = "4.1"
     proves = "P^R is P^D and the residual without EoR, with no cross term"
     experiments: ClassVar = {"minredundant": MINREDUNDANT, "redundant": REDUNDANT}
@@ -175,8 +178,7 @@ class SignalLossBudget(Step):
                 (name, band.low, band.high, *band.losses, band.total, band.measured.value, band.measured.uncertainty)
                 for band in bands
             ]
-            worst = max(bands, key=lambda band: abs(band.pull))
-            values[f"{name}_worst_pull"] = Finding(abs(worst.pull), 1.0)
+            values[f"{name}_worst_pull"] = Finding(largest(abs(band.pull) for band in bands), 1.0)
             remarks += [f"{name}: {_band_sentence(band)}" for band in bands]
         columns = ("experiment", "k from [h/Mpc]", "k to [h/Mpc]", *STAGES, "sum", "end to end", "error")
         Table(columns, rows).write_csv(output / "signal_loss_budget.csv")

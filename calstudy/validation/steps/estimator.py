@@ -63,7 +63,18 @@ from calstudy.power.spectra import DelaySpectra
 from calstudy.products import corruption, spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.step import MINREDUNDANT, REDUNDANT, Case, Findings, Limit, Step, StepInput, only
+from calstudy.validation.step import (
+    MINREDUNDANT,
+    REDUNDANT,
+    Case,
+    Findings,
+    Limit,
+    Step,
+    StepInput,
+    largest,
+    mean_over,
+    only,
+)
 from calstudy.verdicts.criterion import AtLeast, Equal, Finding, Within
 
 
@@ -160,6 +171,7 @@ class FlatSignal(Step):
     """Normalization, p-value of the distribution, and imaginary part."""
 
     kind: str = "flat-signal"
+    version: ClassVar[int] = 2
     number = "0.1"
     proves = "the estimator recovers a flat input P(k) of the EoR, seen through the embedded element beam"
     # Several skies reduce the sampling error, 0.3 % for one.
@@ -200,27 +212,32 @@ class FlatSignal(Step):
                 continue
             found = run.delay_spectra("eor")
             relative = found.power.real / run.input_power(np.array(1.0))
-            normalizations.append(clustered_mean(relative))
+            normalizations.append(mean_over(relative, np.ones(relative.shape, bool)))
             independent.append(thinned(relative, found))
         sample = np.concatenate(independent)
         if sample.size > LARGEST_SAMPLE:
             sample = np.random.default_rng(0).choice(sample, LARGEST_SAMPLE, replace=False)
-        fit = goodness_of_fit(
-            expon, sample, known_params={"loc": 0.0}, statistic="ks", n_mc_samples=DRAWS, rng=np.random.default_rng(1)
-        )
         each = ", ".join(f"{item.value:.4f} ± {item.uncertainty:.4f}" for item in normalizations)
         normalization = pooled(normalizations)
         if len(normalizations) > 1:
             # Their scatter has what the errors of one sky lack.
             scatter = float(sem([item.value for item in normalizations]))
-            normalization = normalization._replace(uncertainty=max(normalization.uncertainty, scatter))
+            normalization = normalization._replace(uncertainty=largest((normalization.uncertainty, scatter)))
         values = {
             "normalization": normalization,
-            "exponential": Finding(float(fit.pvalue), 0.0),
+            "exponential": Finding(_exponential(sample), 0.0),
             "imaginary": imaginary_part(runs[self.redundant]),
         }
         remark = f"normalization of each experiment: {each}; {sample.size} independent modes in the distribution"
         return Findings(values, (remark,))
+
+
+def _exponential(sample: np.ndarray) -> float:
+    """Return the p-value of powers against an exponential distribution, NaN if one is not finite."""
+    if not np.isfinite(sample).all():
+        return np.nan
+    known, rng = {"loc": 0.0}, np.random.default_rng(1)
+    return float(goodness_of_fit(expon, sample, known_params=known, statistic="ks", n_mc_samples=DRAWS, rng=rng).pvalue)
 
 
 def thinned(power: np.ndarray, modes: DelaySpectra) -> np.ndarray:
@@ -274,6 +291,7 @@ class SteepSignal(Step):
     """The mean of P^ over its expectation beyond a wavenumber, for all modes together and in bands."""
 
     kind: str = "steep-signal"
+    version: ClassVar[int] = 2
     number = "0.2"
     proves = "P(k) proportional to k^-2 is recovered, with the window function applied to the input"
     experiments: ClassVar = {"sky 2": STEEP}
@@ -301,18 +319,19 @@ class SteepSignal(Step):
         for run in runs.values():
             found = run.delay_spectra("eor")
             relative = found.power.real / windowed(run.input_power, found)
-            resolved = 2 * np.pi * found.length * found.frequency / SPEED_OF_LIGHT + MARGIN
-            relative[resolved > 3 * run.experiment.sky.eor.nside - 1] = np.nan
+            multipoles = 2 * np.pi * found.length * found.frequency / SPEED_OF_LIGHT + MARGIN
+            resolved = (multipoles <= 3 * run.experiment.sky.eor.nside - 1)[:, None]
             k = np.hypot(found.k_perp[:, None], found.k_parallel)
-            whole.append(clustered_mean(np.where(k > self.k_min, relative, np.nan)))
+            whole.append(mean_over(relative, resolved & (k > self.k_min)))
             for low, high in bands:
-                bands[low, high].append(clustered_mean(np.where((k > low) & (k <= high), relative, np.nan)))
+                bands[low, high].append(mean_over(relative, resolved & (k > low) & (k <= high)))
         parts = {band: pooled(means) for band, means in bands.items() if all(np.isfinite(item.value) for item in means)}
         remarks = tuple(
             f"k from {low:g} to {high:g} h/Mpc: {mean.value:.4f} ± {mean.uncertainty:.4f}"
             for (low, high), mean in parts.items()
         )
-        return Findings({"normalization": pooled(whole), "lowest_band": next(iter(parts.values()))}, remarks)
+        lowest = next(iter(parts.values()), Finding(np.nan, np.nan))
+        return Findings({"normalization": pooled(whole), "lowest_band": lowest}, remarks)
 
 
 def windowed(power: Callable[[np.ndarray], np.ndarray], modes: DelaySpectra) -> np.ndarray:

@@ -32,7 +32,7 @@ from calstudy.calibrate.agreement import ALLOWED, PARTS, pooled
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.records import CalibrationResult
-from calstudy.claims.bins import clustered_mean, reflection_bins
+from calstudy.claims.bins import reflection_bins
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, simulation, spectra
 from calstudy.products.corruption import PARITIES
@@ -40,7 +40,18 @@ from calstudy.products.files import DATA, VISIBILITIES, read_visibilities
 from calstudy.products.gain_errors import gain_coverage, read_coverage
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.validation.step import MINREDUNDANT, Case, Findings, Limit, Step, StepInput, only, required
+from calstudy.validation.step import (
+    MINREDUNDANT,
+    Case,
+    Findings,
+    Limit,
+    Step,
+    StepInput,
+    largest,
+    mean_over,
+    only,
+    required,
+)
 from calstudy.validation.steps.single_fit import first_integrations
 from calstudy.verdicts.criterion import AtMost, Finding, Within
 
@@ -52,6 +63,7 @@ class Flags(Step):
     """The largest influence, and the largest bias in sigma, of all patterns of flags."""
 
     kind: str = "flags"
+    version: ClassVar[int] = 2
     number = "2.3"
     proves = "flagged data (single channels, bands, 30 % at random) have no influence, and the residual is unbiased"
     experiments: ClassVar = {"minredundant": MINREDUNDANT}
@@ -85,18 +97,18 @@ class Flags(Step):
         settings = run.experiment.calibration
         data = {parity: self._read(run.products[parity] / DATA) for parity in PARITIES}
         sky = self._read(run.products["foregrounds"] / VISIBILITIES)
-        influence, biases, remarks = 0.0, {}, []
+        influences, biases, remarks = [], {}, []
         for pattern, flags in patterns(data["even"]).items():
             results = {parity: run_calibrator(settings, flagged(uvd, flags), sky) for parity, uvd in data.items()}
-            influence = max(influence, _influence(data["even"], flags, results["even"], settings, sky))
+            influences.append(_influence(data["even"], flags, results["even"], settings, sky))
             biases[pattern] = bias(results["even"].residual, results["odd"].residual)
             statuses = {record.status for result in results.values() for record in result.solutions}
             remarks.append(
                 f"{pattern} ({100 * flags.mean():.0f} % flagged): bias {biases[pattern].value:.2f} sigma, "
                 f"{', '.join(sorted(statuses))}"
             )
-        worst = max(biases.values(), key=lambda finding: abs(finding.value))
-        values = {"influence": Finding(influence, 0.0), "bias": Finding(abs(worst.value), worst.uncertainty)}
+        worst = largest(abs(finding.value) for finding in biases.values())
+        values = {"influence": Finding(largest(influences), 0.0), "bias": Finding(worst, 1.0)}
         return Findings(values, tuple(remarks))
 
     def _read(self, path: Path) -> UVData:
@@ -124,7 +136,7 @@ def flagged(data: UVData, flags: np.ndarray, value: complex | None = None) -> UV
 
 
 def _influence(data: UVData, flags: np.ndarray, result: CalibrationResult, settings: Calibrator, sky: UVData) -> float:
-    largest = 0.0
+    changes = []
     for value in (HUGE * (1 + 2j), complex(np.nan, np.nan)):
         other = run_calibrator(settings, flagged(data, flags, value), sky)
         for mine, its in (
@@ -132,17 +144,16 @@ def _influence(data: UVData, flags: np.ndarray, result: CalibrationResult, setti
             (result.model.data_array, other.model.data_array),
             (result.residual.data_array, other.residual.data_array),
         ):
-            largest = max(largest, float(np.abs(mine - its).max()))
-    return largest
+            changes.append(np.abs(mine - its).max())
+    return largest(changes)
 
 
 def bias(even: UVData, odd: UVData) -> Finding:
     """Return the mean of Re R_even* R_odd over unflagged samples in units of its standard error."""
     used = ~(flag_cube(even) | flag_cube(odd))
-    product = np.where(used, (to_cube(even).conj() * to_cube(odd)).real, np.nan)
+    product = (to_cube(even).conj() * to_cube(odd)).real
     # One sample per baseline: its times and channels share gains and model.
-    samples = product.transpose(1, 0, 2, 3).reshape(product.shape[1], -1)
-    found = clustered_mean(samples)
+    found = mean_over(*(cube.transpose(1, 0, 2, 3).reshape(cube.shape[1], -1) for cube in (product, used)))
     return Finding(found.value / found.uncertainty, 1.0)
 
 
@@ -213,6 +224,7 @@ class LowSnr(Step):
     """
 
     kind: str = "low-snr"
+    version: ClassVar[int] = 2
     number = "3.0"
     proves = "cable reflections below the noise of a baseline are removed"
     experiments: ClassVar = {"lowsnr": Case("lowsnr.yaml", small=SMALL)}
@@ -233,7 +245,8 @@ class LowSnr(Step):
         """Compare the spectra before and after calibration."""
         run = only(runs)
         corrupted, residual = (run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual"))
-        chosen = reflection_bins(run, run.experiment, residual)
+        # Bins without a number in the residual are not left out.
+        chosen = reflection_bins(run, run.experiment, corrupted)
         weights = residual.noise_error[chosen] ** -2.0
         artefact, left = (
             float(np.sum(weights * spectrum.power.real[chosen]) / weights.sum()) for spectrum in (corrupted, residual)

@@ -27,7 +27,6 @@ from pyradiosky import SkyModel
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.visibilities import baseline_vectors, subset_template
-from calstudy.claims.bins import clustered_mean
 from calstudy.corrupt.levels import rms
 from calstudy.experiment.model import Component, Variant
 from calstudy.instrument.beams import make_beam
@@ -44,7 +43,7 @@ from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import SyntheticSources
-from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only
+from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, largest, mean_over, only
 from calstudy.verdicts.criterion import AtMost, Finding
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ class Engines(Step):
     """The largest differences of the engines from pyuvsim, over the rms, and from the closed form."""
 
     kind: str = "engines"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     number = "-1"
     proves = "simulation engines agree with pyuvsim and with closed forms"
     parameters: ClassVar = {
@@ -105,9 +104,11 @@ class Engines(Step):
         """Run all engines on the same simulation, and on single sources."""
         compared = [item for item in CANDIDATES if item[0] in self.engines]
         errors, closed = self.errors(compared), {item: closed_form_error(*item) for item in compared}
-        both = {**errors, **{key: max(errors.get(key, 0.0), value) for key, value in closed.items()}}
+        both = {**errors, **{key: largest((errors.get(key, 0.0), value)) for key, value in closed.items()}}
         values = {
-            f"{precision}_{what}": Finding(max(value for (_, kind), value in found.items() if kind == precision), 0.0)
+            f"{precision}_{what}": Finding(
+                largest(value for (_, kind), value in found.items() if kind == precision), 0.0
+            )
             for precision in ("double", "single")
             for what, found in (("pyuvsim", errors), ("closed_form", closed))
             if any(kind == precision for _, kind in found)
@@ -150,13 +151,13 @@ def closed_form_error(engine: str, precision: str) -> float:
     template = make_template(settings)
     beam = make_beam(settings.beam, settings.channels)
     simulator = _make(engine, precision)
-    worst = 0.0
+    differences = []
     for zenith_angle, azimuth in OFFSETS:
         angles = np.radians([zenith_angle, azimuth])
         sky = _source(template, *angles)
         cube = simulator.simulate(sky, beam, template)[0, :, :, 0]
-        worst = max(worst, float(np.abs(cube / _closed_form(template, *angles) - 1).max()))
-    return worst
+        differences.append(np.abs(cube / _closed_form(template, *angles) - 1).max())
+    return largest(differences)
 
 
 def _source(template: UVData, zenith_angle: float, azimuth: float) -> SkyModel:
@@ -189,6 +190,7 @@ class Foregrounds(Step):
     """P^{F+S} / P^S - 1 over all modes outside the wedge, the floor P^F / P^S, and the excess over it."""
 
     kind: str = "foregrounds"
+    version: ClassVar[int] = 2
     number = "1.0"
     proves = "outside the wedge, the power of foregrounds and EoR equals that of the EoR alone"
     experiments: ClassVar = {"minredundant": MINREDUNDANT}
@@ -255,5 +257,5 @@ def beyond_wedge(signal: DelaySpectra, buffer: float) -> np.ndarray:
 def _over_signal(power: np.ndarray, signal: DelaySpectra, used: np.ndarray) -> Finding:
     """Return the mean of `power` over that of the signal, over the modes used."""
     level = float(signal.power.real[used].mean())
-    found = clustered_mean(np.where(used, power, np.nan))
+    found = mean_over(power, used)
     return Finding(found.value / level, found.uncertainty / level)

@@ -52,7 +52,7 @@ from calstudy.products.files import VISIBILITIES, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.products.selection import read_gains
 from calstudy.run.task import Task
-from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, only, required
+from calstudy.validation.step import MINREDUNDANT, Findings, Limit, Step, StepInput, largest, only, required
 from calstudy.verdicts.criterion import AtMost, Finding
 
 
@@ -232,6 +232,7 @@ class Degeneracies(SingleIntegrationStep):
     """The largest difference of any exchange, before and after a fit."""
 
     kind: str = "degeneracies"
+    version: ClassVar[int] = 2
     number = "2.1"
     proves = (
         "overall phase, scale, tip-tilt and exchanges of smooth gains with foregrounds leave the residual unchanged"
@@ -264,11 +265,13 @@ class Degeneracies(SingleIntegrationStep):
         settings = integration.settings.model_copy(update={"solver": solver})
         reference = integration.calibrate(visibilities, settings)
         before = best_misfit(integration, visibilities, gains)
-        exact, fitted, remarks = dict.fromkeys(EXCHANGES, 0.0), {}, []
+        exact, fitted, remarks = {}, {}, []
         for kind, draw in EXCHANGES.items():
+            changes = []
             for _ in range(self.draws):
                 after = best_misfit(integration, visibilities, gains * draw(integration, rng))
-                exact[kind] = max(exact[kind], rms(after - before) / rms(visibilities))
+                changes.append(rms(after - before) / rms(visibilities))
+            exact[kind] = largest(changes)
             moved = integration.calibrate(visibilities, settings, start=draw(integration, rng))
             change = residual(integration, kind, moved, visibilities) - residual(
                 integration, kind, reference, visibilities
@@ -279,7 +282,7 @@ class Degeneracies(SingleIntegrationStep):
                 f"{kind}: exact {exact[kind]:.1e}, fitted {fitted[kind]:.1e} ({record.status}, {record.steps} steps)"
             )
         remarks.append(f"noise {integration.noise_std / rms(visibilities):.1e} of the data")
-        values = {"exact": max(exact.values()), "fitted": max(fitted.values())}
+        values = {"exact": largest(exact.values()), "fitted": largest(fitted.values())}
         values |= {f"fitted_{kind}": value for kind, value in fitted.items()}
         return Findings({name: Finding(value, 0.0) for name, value in values.items()}, tuple(remarks))
 
