@@ -45,6 +45,10 @@ class Reference:
     on_machines: bool = False
 
 
+WITHOUT_ERROR = 0.01
+"""Elements whose error is not known may move by this part of the largest: other processors change fits by less."""
+
+
 def find_references(folders: Sequence[Path]) -> list[Path]:
     """Return the reference folders among these and directly below; raise InputError for a folder without any."""
     found: list[Path] = []
@@ -279,7 +283,7 @@ def compare_array(
     relative, deviations = _relative(old, made), None
     if isinstance(rule, Drawn):
         sigma = np.broadcast_to(np.sqrt(2) * rule.error(reference, name), old.shape)
-        if _relative(old, made, ~(sigma > 0)) > ROUNDING:
+        if _relative(old, made, ~(sigma > 0)) > WITHOUT_ERROR:
             return ArrayComparison(figure, name, "beyond", relative, problem="moved where the reference has no error")
         deviations = _deviations(name, old, made, sigma)
     if relative <= ROUNDING and (deviations is None or deviations[0] <= ROUNDING):

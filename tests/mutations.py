@@ -82,8 +82,9 @@ MUTATIONS = (
     Mutation(
         "a prior weighed against the noise of one of several measurements",
         'None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]',
-        'None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"] * data.nsample_array.max() ** 0.5',
-        ("tests/calibrate/test_calibrate_command.py", "tests/products/test_noise_level.py"),
+        "None if self.levels is None else data.nsample_array.max() ** 0.5 * "
+        'read_json(self.levels / LEVELS)["noise_std"]',
+        ("tests/calibrate/test_calibrate_command.py",),
     ),
     Mutation("noise in each part", "noise *= std / np.sqrt(2)", "noise *= std", CORRUPTION),
     Mutation(

@@ -1,4 +1,4 @@
-"""The level of the noise that a finite prior is weighed against: that of the data, by their autocorrelations and chi^2."""
+"""The noise that a finite prior is weighed against is that of the data, by their autocorrelations and by chi^2."""
 
 from __future__ import annotations
 
