@@ -70,6 +70,16 @@ def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float,
     return Finding(float(np.sum(weights * residual.power.real[used]) / norm), float(norm**-0.5))
 
 
+def recovered_outside_wedge(run: Results, k_min: float, k_max: float = np.inf) -> Finding:
+    """Return what `recovered` does, of a run outside the wedge, with the error of what is left without EoR in it."""
+    residual, eor = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
+    found, used = recovered(residual, eor, k_min, k_max), used_bins(residual, eor, k_min=k_min, k_max=k_max)
+    signal, error = eor.power.real[used], residual.difference_error[used]
+    weights = signal / error**2
+    left = np.sum(weights * error_of_what_is_left(run)[used]) / np.sum(weights * signal)
+    return found._replace(uncertainty=float(np.hypot(found.uncertainty, left)))
+
+
 def fraction_within(value: np.ndarray, error: np.ndarray) -> Finding:
     """Return the fraction of the values within their 95 % error bars of zero, with the binomial error for 95 %."""
     inside = np.abs(value) <= SIGMAS_95 * error
@@ -92,8 +102,8 @@ def ratio(above: Finding, below: Finding) -> Finding:
 class RecoveredPower:
     """Quantities by which two runs are compared, in the same bins.
 
-    `loss_error` is the standard deviation of the transfer function, (Nk,): the runs lose different amounts by
-    chance.
+    `loss_error` is the standard deviation of the transfer function, (Nk,), and of what is left without EoR: the runs
+    lose and leave different amounts by chance.
     """
 
     residual: SphericalSpectrum
@@ -211,6 +221,14 @@ def _above_noise(run: Results, used: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """
     power, noise, rest = _without_eor(run, used)
     return power, noise, np.where(np.abs(power) > SEEN * noise, rest, 0)
+
+
+def error_of_what_is_left(run: Results) -> np.ndarray:
+    """Return the error of P^R0 in bins outside the wedge but for noise, (Nk,); zero if P^R0 is not above the noise."""
+    residual = run.spherical("residual_without_eor", "outside-wedge")
+    known, found = np.isfinite(residual.power.real) & np.isfinite(residual.noise_error), np.zeros(residual.k.size)
+    found[known] = _above_noise(run, known)[2]
+    return found
 
 
 def rms_without_eor(run: Results, used: np.ndarray, units: np.ndarray | float = 1.0) -> Finding:

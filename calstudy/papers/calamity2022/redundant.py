@@ -13,10 +13,11 @@ from calstudy.claims.bins import (
     bias_extent,
     difference_of_losses,
     difference_of_ratios,
+    error_of_what_is_left,
     fraction_within,
     mean_of_common_errors,
     ratio,
-    recovered,
+    recovered_outside_wedge,
     reflection_bins,
     rms_power,
     rms_without_eor,
@@ -120,21 +121,18 @@ def redundant_residual_relatively_unbiased(redundant: Results) -> Finding:
     pooled=over_realizations("ratio", "outside-wedge", K_LOSS),
 )
 def redundant_residual_unbiased(redundant: Results) -> Finding:
-    return recovered(
-        redundant.spherical("residual", "outside-wedge"), redundant.spherical("eor", "outside-wedge"), K_LOSS, np.inf
-    )
+    return recovered_outside_wedge(redundant, K_LOSS)
 
 
 def _recovered_powers(minimal: Results, redundant: Results) -> tuple[RecoveredPower, RecoveredPower]:
-    first, second = (
-        RecoveredPower(
-            run.spherical("residual", "outside-wedge"),
-            run.spherical("eor", "outside-wedge"),
-            run.transfer("outside-wedge").transfer_error,
-        )
-        for run in (minimal, redundant)
-    )
+    first, second = (_recovered_power(run) for run in (minimal, redundant))
     return first, second
+
+
+def _recovered_power(run: Results) -> RecoveredPower:
+    residual, eor = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
+    left = error_of_what_is_left(run) / eor.power.real
+    return RecoveredPower(residual, eor, np.hypot(run.transfer("outside-wedge").transfer_error, left))
 
 
 def _used_bins(runs: tuple[RecoveredPower, RecoveredPower], k_min: float, k_max: float) -> np.ndarray:

@@ -11,6 +11,7 @@ from calstudy.claims.bins import (
     pull_without_eor,
     ratio,
     recovered,
+    recovered_outside_wedge,
     rms_without_eor,
     used_bins,
 )
@@ -170,7 +171,7 @@ def residual_agrees_outside_wedge(run: Results) -> Finding:
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_level_outside_wedge(run: Results) -> Finding:
-    return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
+    return recovered_outside_wedge(run, K_AGREEMENT)
 
 
 @RESULTS.states(
@@ -181,7 +182,7 @@ def residual_level_outside_wedge(run: Results) -> Finding:
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_relatively_unbiased_outside_wedge(run: Results) -> Finding:
-    return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
+    return recovered_outside_wedge(run, K_AGREEMENT)
 
 
 @RESULTS.states(
@@ -192,7 +193,7 @@ def residual_relatively_unbiased_outside_wedge(run: Results) -> Finding:
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_unbiased_outside_wedge(run: Results) -> Finding:
-    return recovered(run.spherical("residual", "outside-wedge"), run.spherical("eor", "outside-wedge"), K_AGREEMENT)
+    return recovered_outside_wedge(run, K_AGREEMENT)
 
 
 BIAS = "when we include modes inside of the wedge, we encounter negative bias out to ≈ 0.3 h/Mpc"
