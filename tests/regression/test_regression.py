@@ -188,16 +188,16 @@ def test_scores_of_fits_without_a_solution_depend_on_where_they_stopped(converge
     [
         ([0, 0, 0], [1e6, -2e6, 3], "beyond"),
         ([np.nan] * 3, [1e6, -2e6, 3], "beyond"),
-        ([0, np.nan, 0.1], [1, 2.001, 3], "beyond"),
+        ([0, np.nan, 0.1], [1, 2.04, 3], "beyond"),
         ([0, np.nan, 0.1], [1, 2, 3.1], "moved"),
-        # Rounding, a millionth of the largest, is no move.
-        ([0, np.nan, 0.1], [1 + 1e-7, 2 - 1e-7, 3.1], "moved"),
+        # Other processors move fits by less than 1 % of the largest.
+        ([0, np.nan, 0.1], [1.02, 2 - 0.02, 3.1], "moved"),
         ([0, np.nan, 0.1], [1 + 1e-7, 2 - 1e-7, 3], "same"),
         # Of an infinite error anything may come.
         ([np.inf] * 3, [1e6, -2e6, 3], "moved"),
     ],
 )
-def test_what_has_no_error_bar_may_not_move(error, made, status):
+def test_what_has_no_error_bar_may_move_by_a_percent(error, made, status):
     reference = {"x": np.array([1.0, 2.0, 3.0]), "x_error": np.array(error, float)}
     assert compare_array("figure", "x", reference, np.array(made, float)).status == status
 
