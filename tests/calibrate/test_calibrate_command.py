@@ -193,8 +193,8 @@ def test_samples_of_many_measurements_have_the_noise_of_all_of_them(command, fin
         block = ["--set", "calibrator=delay-weighted", "--select", "times=0..0", "--output", name]
         assert command(f"{name}.uvh5", *block, "--sky-model", "sky.uvh5", "--no-gain-errors")[0] == 0
         found[name] = read_gains(tmp_path / name / "gains.calh5", "test").gain_array
-    # The fits stop at a tolerance of 1e-5.
-    assert found["often"] == pytest.approx(found["once"], rel=1e-5)
+    # The fits stop at a tolerance of 1e-5; noise three times too large moves gains by 1e-3 and more.
+    assert found["often"] == pytest.approx(found["once"], rel=1e-4)
 
 
 def test_the_log_tells_every_solve(finished):
