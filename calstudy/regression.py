@@ -45,6 +45,7 @@ class Reference:
     on_machines: bool = False
 
 
+UNKNOWN_ERROR = "moved by more than 1 % where the reference has no error"
 WITHOUT_ERROR = 0.01
 """Elements whose error is not known may move by this part of the largest: other processors change fits by less."""
 
@@ -284,7 +285,7 @@ def compare_array(
     if isinstance(rule, Drawn):
         sigma = np.broadcast_to(np.sqrt(2) * rule.error(reference, name), old.shape)
         if _relative(old, made, ~(sigma > 0)) > WITHOUT_ERROR:
-            return ArrayComparison(figure, name, "beyond", relative, problem="moved where the reference has no error")
+            return ArrayComparison(figure, name, "beyond", relative, problem=UNKNOWN_ERROR)
         deviations = _deviations(name, old, made, sigma)
     if relative <= ROUNDING and (deviations is None or deviations[0] <= ROUNDING):
         status = "same"

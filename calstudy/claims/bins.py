@@ -87,7 +87,7 @@ def fraction_within(value: np.ndarray, error: np.ndarray) -> Finding:
 
 
 def rms_power(spectrum: SphericalSpectrum, used: np.ndarray) -> Finding:
-    """Return the rms of P over bins, with the uncertainty of as many independent bins that are alike, as of noise."""
+    """Return the rms of P over bins, with the uncertainty for independent bins of the same variance, as noise has."""
     value = float(np.sqrt(np.mean(spectrum.power.real[used] ** 2)))
     return Finding(value, value / np.sqrt(2 * used.sum()))
 

@@ -62,10 +62,10 @@ def evaluate_run(papers: Sequence[Paper], results: Results | PooledResults) -> E
             verdicts[paper.label] = _evaluate(paper, dict.fromkeys(played, results), only_played=True)
         else:
             without_role.append(_told(paper, refusals))
-    return Evaluation(_of_all(verdicts), tuple(without_role))
+    return Evaluation(_with_names_of_papers(verdicts), tuple(without_role))
 
 
-def _of_all(verdicts: Mapping[str, list[Verdict]]) -> list[Verdict]:
+def _with_names_of_papers(verdicts: Mapping[str, list[Verdict]]) -> list[Verdict]:
     """Return the verdicts of all papers, by label; if there are several, sections are named with their paper."""
     several = sum(map(bool, verdicts.values())) > 1
     return [
@@ -111,7 +111,7 @@ def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, Results | Poole
     pooled = bool(runs) and all(isinstance(run, PooledResults) for run in runs.values())
     verdicts = {paper.label: _evaluate(paper, _accepted(paper, runs), pooled) for paper in papers}
     refused = [reason for paper in papers for reason in _refused(paper, runs)]
-    return Evaluation(_of_all(verdicts), tuple(refused))
+    return Evaluation(_with_names_of_papers(verdicts), tuple(refused))
 
 
 def evaluate_by_solver(

@@ -33,10 +33,10 @@ class Drawn:
     """May change to another draw: compared in units of the error of a difference of two draws, √2 σ.
 
     `error` returns σ of each element (of the real part, if they are complex), in a shape that broadcasts, for the
-    reference arrays and the array's name, and `why` describes it. An element may not move if its error is zero or NaN,
-    and may by anything if it is infinite. The limits are those of the `largest` deviation of an element, of the `rms`
-    of all, σ, and of the mean deviation in its own standard errors, as if the elements were independent: a common
-    `shift` of the whole array shows there first.
+    reference arrays and the array's name, and `why` describes it. An element whose error is zero or NaN may move by
+    one percent (`calstudy.regression.WITHOUT_ERROR`), one whose error is infinite by anything. The limits are those of
+    the `largest` deviation of an element, of the `rms` of all, σ, and of the mean deviation in its own standard errors,
+    as if the elements were independent: a common `shift` of the whole array shows there first.
     """
 
     error: Callable[[Arrays, str], np.ndarray]
