@@ -32,6 +32,8 @@ def load_tensorflow() -> None:
     """
     require_tensorflow()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # A process takes all memory of a GPU by default, and the workers of a run share one.
+    os.environ.setdefault("TF_FORCE_GPU_ALLOW_GROWTH", "true")
     if "tensorflow" in sys.modules:
         return
     with _without_keras(), errors_written_to(Path(os.devnull)):
