@@ -484,14 +484,18 @@ def test_gains_come_back_as_casa_tables(skycal, exported, tmp_path):
     assert np.abs(found.gain_array - own.gain_array).max() < 1e-6 * np.abs(own.gain_array).max()
 
 
-def test_the_program_of_the_challenge_page_finds_the_gains_of_skycal(exported, skycal, tmp_path):
+@pytest.mark.parametrize(
+    ("passes", "weights"), [(1, "flags"), (3, {"kind": "gains", "passes": 3, "tolerance": 1e-12})], ids=["equal", "own"]
+)
+def test_the_program_of_the_challenge_page_finds_the_gains_of_skycal(exported, tmp_path, passes, weights):
     """Two programs minimize the same function; the phase of all antennas together is free in every channel."""
     folder = tmp_path / "copy"
     shutil.copytree(exported, folder)
+    skycal = calibrate(exported, tmp_path / "by-skycal", {**SKYCAL, "weights": weights})
     page = (ROOT / "docs" / "challenge" / "README.md").read_text()
     [code] = re.findall(r"```python\n(# calibrate.py.*?)```", page, re.DOTALL)
     (tmp_path / "calibrate.py").write_text(code)
-    subprocess.run([sys.executable, tmp_path / "calibrate.py", folder], check=True)
+    subprocess.run([sys.executable, tmp_path / "calibrate.py", folder, str(passes)], check=True)
     for name in NAMES:
         found, expected = (UVCal.from_file(place / f"{name}.calh5") for place in (folder, skycal))
         assert np.array_equal(found.flag_array, expected.flag_array)
