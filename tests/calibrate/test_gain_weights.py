@@ -12,13 +12,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from toy import FREQUENCIES, LARGE_HEX, complex_normal, make_toy, point_source_visibilities, scattered
-from toy_data import SETTINGS, make_uvdata, sky_of
+from toy_data import SETTINGS, make_uvdata, sky_of, statuses
 
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import flag_cube, to_cube
 from calstudy.calibrate import calamity
 from calstudy.calibrate.basis import dpss_vectors
 from calstudy.calibrate.calamity import make_solver
+from calstudy.calibrate.calibrators import other_packages
 from calstudy.calibrate.calibrators.least_squares import Calamity, EmpiricalBayes, SkyBased
 from calstudy.calibrate.calibrators.other_packages import Skycal
 from calstudy.calibrate.calibrators.redcal import Redcal
@@ -104,6 +105,25 @@ def test_equal_weights_throw_the_errors_of_the_sky_to_all_delays_and_own_weights
     assert white > 10 * smooth
     # With the tolerance of the default, 1e-4, of errors of a tenth.
     assert weighted < 1.2 * smooth
+
+
+def test_passes_that_swing_settle_at_a_result_that_does_not_depend_on_the_gains(monkeypatch):
+    """Where the sky model lacks much, a gain that is too small in one pass is too large in the next."""
+    toy = make_toy(scattered(8), noise=1e-5)
+    lacking = point_source_visibilities(toy.vectors, np.random.default_rng(21), 50)
+    lacking *= 0.7 * np.sqrt(np.mean(np.abs(toy.foregrounds) ** 2) / np.mean(np.abs(lacking) ** 2))
+    sky, toy = toy.foregrounds, replace(toy, foregrounds=toy.foregrounds + lacking)
+    found = []
+    for gains in (np.ones_like(toy.gains), white_gains(len(toy.positions))):
+        uvd = make_uvdata(replace(toy, gains=gains), n_times=1)
+        result = run_calibrator(Skycal(weights=TIGHT), uvd, sky_of(uvd, sky))
+        assert statuses(result) == ["converged"]
+        rows = ~result.gains.flag_array.all(axis=(1, 2, 3))
+        found.append(result.gains.gain_array[rows, :, 0, 0] / gains)
+    # Weights settle to 1e-6, by a factor of two in a pass.
+    assert np.abs(fix_phase(found[1], found[0]) - found[0]).max() < 1e-4
+    monkeypatch.setattr(other_packages, "SLOW", np.inf)
+    assert statuses(run_calibrator(Skycal(weights=TIGHT), uvd, sky_of(uvd, sky))) != ["converged"]
 
 
 def left_of(calibrator, toy, signal):

@@ -485,7 +485,10 @@ def test_gains_come_back_as_casa_tables(skycal, exported, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("passes", "weights"), [(1, "flags"), (3, {"kind": "gains", "passes": 3, "tolerance": 1e-12})], ids=["equal", "own"]
+    ("passes", "weights"),
+    # Passes go half of the way, so that 25 end within 1e-7 of where they lead.
+    [(1, "flags"), (25, {"kind": "gains", "passes": 30, "tolerance": 1e-8})],
+    ids=["equal", "own"],
 )
 def test_the_program_of_the_challenge_page_finds_the_gains_of_skycal(exported, tmp_path, passes, weights):
     """Two programs minimize the same function; the phase of all antennas together is free in every channel."""

@@ -43,6 +43,8 @@ class Ddecal(OtherPackage):
     Every polarization is solved by itself, from a temporary measurement set, which holds single precision.
     """
 
+    # Passes that swing go half of the way since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "ddecal"
     smoothness: Frequency | None = Field(
         None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -23,6 +23,8 @@ from calstudy.instrument.settings import Size
 
 # hera_cal wants a name for the polarization; each is calibrated by itself.
 POL, FEED = "nn", "Jnn"
+SLOW = 0.5
+"""Weights of passes converge if their changes fall below this part of the change before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +91,8 @@ class OtherPackage(WeightedFit):
         """Solve every group of integrations.
 
         The data are of one polarization, with weight in each group. `before` is None in the first pass. If weights come
-        from the gains, it is the previous pass; the weights are then those of `measured` over |g_a g_b|^2 of its gains
-        (`Measured.weighted_by`).
+        from the gains, it is the previous pass, with the gains that make the weights: those of `measured` over
+        |g_a g_b|^2 (`Measured.weighted_by`).
         """
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
@@ -150,23 +152,35 @@ class OtherPackage(WeightedFit):
         return gains, ended
 
     def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> Solved:
-        """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle."""
-        settings, weights = self.weights, measured.weights
+        """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle.
+
+        Where the sky model lacks much, gains that are too small in one pass are too large in the next, and ever more
+        so. Passes whose weights change by more than `SLOW` times the change before go half of the way.
+        """
+        settings = self.weights
         solved = first = self.solve(measured, groups)
         if not isinstance(settings, GainWeights):
             return solved
-        passes = 1
+        passes, used, weights, before = 1, np.ones_like(solved.gains), measured.weights, np.full(len(groups), np.inf)
         while True:
-            before, weights = weights, measured.weighted_by(solved.gains, groups).weights
-            changes = [weight_change(weights[times], before[times]) for times in groups]
+            wanted = measured.weighted_by(solved.gains, groups).weights
+            changes = np.array([weight_change(wanted[times], weights[times]) for times in groups])
             if passes == settings.passes or max(changes) < settings.tolerance:
                 break
-            solved = self.solve(measured, groups, solved)
-            passes += 1
-        gains = np.where(np.array(changes) > RUNAWAY, first.gains, solved.gains) if passes > 1 else solved.gains
+            used = np.where(changes > SLOW * before, _halfway(used, solved.gains), solved.gains)
+            solved = self.solve(measured, groups, solved._replace(gains=used))
+            passes, weights, before = passes + 1, measured.weighted_by(used, groups).weights, changes
+        gains = np.where(changes > RUNAWAY, first.gains, solved.gains) if passes > 1 else solved.gains
         unsettled = [settings.unsettled(found) for found in changes]
-        ended = zip(solved.outcomes, changes, unsettled, strict=True)
+        ended = zip(solved.outcomes, changes.tolist(), unsettled, strict=True)
         return Solved(gains, [_in_passes(*each, passes) for each in ended])
+
+
+def _halfway(used: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Return gains whose modulus is the geometric mean of two, with the phase of those found."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = found * np.sqrt(np.abs(used) / np.abs(found))
+    return np.where(np.isfinite(between) & (between != 0), between, found)
 
 
 def _in_passes(outcome: Solve, change: float, unsettled: bool, passes: int) -> Solve:
@@ -202,6 +216,8 @@ class Skycal(OtherPackage):
     Amplitudes come only from the cross-correlations, and not from the autocorrelations as in HERA's own pipeline.
     """
 
+    # Passes that swing go half of the way since 2.
+    version: ClassVar[int] = 2
     calibrator: str = "skycal"
     delays: bool = Field(True, description="First fit a delay and a phase per antenna.")
     tolerance: float = Field(1e-8, gt=0, lt=1, description="Stop when no gain of a channel changes by more.")

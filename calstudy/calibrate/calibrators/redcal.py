@@ -55,8 +55,8 @@ class Redcal(OtherPackage):
     """
 
     # Amplitude and phase gradient have the weights of calibrated data since 2; passes after one that converged start
-    # from its gains since 3.
-    version: ClassVar[int] = 3
+    # from its gains since 3; passes that swing go half of the way since 4.
+    version: ClassVar[int] = 4
     calibrator: str = "redcal"
     redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
     steps: Annotated[tuple[Step, ...], Field(strict=False, min_length=1)] = Field(
