@@ -74,6 +74,12 @@ MUTATIONS = (
         CORRUPTION,
     ),
     Mutation(
+        "passes of weights that swing go all of the way",
+        "            used = np.where(changes > SLOW * before, _halfway(used, solved.gains), solved.gains)\n",
+        "            used = solved.gains\n",
+        ("tests/calibrate/test_gain_weights.py",),
+    ),
+    Mutation(
         "a prior weighed against the noise before the gains",
         "            amplitudes = of_antennas[:, first] * of_antennas[:, second]\n",
         "",
