@@ -24,7 +24,7 @@ from calstudy.instrument.settings import Size
 # hera_cal wants a name for the polarization; each is calibrated by itself.
 POL, FEED = "nn", "Jnn"
 SLOW = 0.5
-"""Weights of passes converge if their changes fall below this part of the change before."""
+"""Passes whose weights change by more than this part of the change before go half of the way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +154,8 @@ class OtherPackage(WeightedFit):
     def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> Solved:
         """Solve groups; with weights from the gains, repeat with those of the previous pass until they settle.
 
-        Where the sky model lacks much, gains that are too small in one pass are too large in the next, and ever more
-        so. Passes whose weights change by more than `SLOW` times the change before go half of the way.
+        Where the sky model lacks much, gains that are too small in one pass are too large in the next, further each
+        time. Passes that do not settle by themselves go half of the way (`SLOW`).
         """
         settings = self.weights
         solved = first = self.solve(measured, groups)
