@@ -86,7 +86,12 @@ UNSETTLED = 10.0
 LEAST_TAPER = 1e-4
 """Antennas whose baselines all have less than this part of their weight are left out of a fit."""
 RUNAWAY = 1.0
-"""Weights that change by more than themselves in the last pass run away; the result is that of equal weights then."""
+"""Weights that change by more than themselves in the last pass run away; the result is that of equal weights then.
+
+Unlike calibrators of other packages, fits of our own do not go half of the way. They run away where gains have errors
+of a quarter; half steps settle there, but at gains that are no better than those of equal weights (HERA-19, k of 0.3 to
+0.5: T of 0.91 +- 0.23, with equal weights 0.88 +- 0.04).
+"""
 
 
 class GainWeights(Section):
