@@ -381,7 +381,8 @@ class OpenRun:
         """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
 
         Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
-        limit in all worlds in units of the EoR, and `transfer`, the smallest T.
+        limit in all worlds in units of the EoR, and `transfer`, the smallest T, of the linear response where that is
+        lower by more than the error of T.
         """
         import pandas
 

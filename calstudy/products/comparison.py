@@ -119,10 +119,10 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=9):
+class Comparison(Task, stage="comparison", version=10):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
 
-    The table has C beside T since version 9.
+    The table has C beside T since version 9, and verdicts the linear response where it is lower since 10.
     """
 
     title: str

@@ -16,6 +16,9 @@ T is measured where it can be the part of the EoR's power that is left. A T belo
 calibration that found a solution: noise, interference or a fit that diverged makes such values. With an error above 0.3
 the 95 % interval contains most values from 0 to 1. An error is NaN where a bin has a single sample; T is then judged by
 its value.
+
+T by injection depends on where two fits stop, and T of the linear response does not. What a calibrator keeps is the
+linear response where that is lower by more than the error of T.
 """
 
 from __future__ import annotations
@@ -89,6 +92,7 @@ class InWorld:
     transfer_error: float = math.nan
     bias: float = math.nan
     bias_error: float = math.nan
+    linear_transfer: float = math.nan
     refused: bool = False
     solves: Mapping[str, int] = field(default_factory=dict)
     """Number of solves by status."""
@@ -102,6 +106,14 @@ class InWorld:
             return "fails"
         known = is_measured(self.transfer, self.transfer_error)
         return "passes" if known and self.upper_limit < limit else "open"
+
+    @property
+    def kept(self) -> float:
+        """T, or that of the linear response where it is lower by more than the error of T; NaN if T is not measured."""
+        if not is_measured(self.transfer, self.transfer_error):
+            return math.nan
+        # With NaN, no comparison is true.
+        return self.linear_transfer if self.transfer - self.linear_transfer > self.transfer_error else self.transfer
 
     @property
     def _is_no_solution(self) -> bool:
@@ -139,12 +151,12 @@ class InBand:
 
     @property
     def transfer(self) -> float:
-        """The smallest T of all worlds where it is measured."""
+        """The smallest part of the EoR that is kept in a world, of all where T is measured."""
         return min(self._measured, default=math.nan)
 
     @property
     def _measured(self) -> list[float]:
-        return [world.transfer for world in self.worlds if is_measured(world.transfer, world.transfer_error)]
+        return [world.kept for world in self.worlds if not math.isnan(world.kept)]
 
     @property
     def kept(self) -> str:
@@ -234,9 +246,9 @@ def standings(
 
 
 def _in_world(world: str, band: Mapping[str, Any], solves: Mapping[str, int]) -> InWorld:
-    names = ("transfer", "transfer_error", "bias", "bias_error")
-    transfer, transfer_error, bias, bias_error = (math.nan if band[name] is None else band[name] for name in names)
-    return InWorld(world, transfer, transfer_error, bias, bias_error, solves=solves)
+    names = ("transfer", "transfer_error", "bias", "bias_error", "linear_transfer")
+    found: dict[str, Any] = {name: math.nan if band.get(name) is None else band[name] for name in names}
+    return InWorld(world, solves=solves, **found)
 
 
 def advice(found: Sequence[InBand]) -> list[str]:
@@ -286,7 +298,8 @@ def standing_table(found: Sequence[InBand]) -> Table:
     limit = found[0].limit if found else LIMIT
     note = (
         f"A calibrator passes if |bias| + {SIGMAS:g}σ is below {limit:g} of the EoR in all worlds, and fails if "
-        f"|bias| - {SIGMAS:g}σ is above it in one; otherwise this run cannot tell. Errors fall with the number of "
+        f"|bias| - {SIGMAS:g}σ is above it in one; otherwise this run cannot tell. T is the smallest of all worlds, "
+        "or the linear response where that is lower by more than the error of T. Errors fall with the number of "
         "integrations within power.coherent_time, and with the square of the noise."
     )
     columns = ("calibrator", *(f"k {low:g} to {high:g} h/Mpc" for low, high in bands))

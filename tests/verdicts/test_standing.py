@@ -47,6 +47,17 @@ def test_solves_that_did_not_converge_are_said_beside_the_numbers():
     assert str(standing_of(cases[0])).endswith("T ≥ 0.80")
 
 
+def test_what_is_kept_is_no_more_than_the_linear_response_says():
+    """T by injection depends on where two fits stop, in either direction, and the linear response does not."""
+    kept = {}
+    for linear in (None, 0.6, 0.795, 0.9):
+        found = case(0.0, 0.01)
+        found["bands"][0]["linear_transfer"] = linear
+        kept[linear] = standing_of(found, case(0.0, 0.01, transfer=0.85)).transfer
+    # Within the error of T they are the same.
+    assert kept == {None: 0.8, 0.6: 0.6, 0.795: 0.8, 0.9: 0.8}
+
+
 def test_the_worst_world_decides_and_is_named():
     good, bad = case(0.0, 0.01), case(44.0, 9.0)
     assert standing_of(good, good).standing == "passes"
