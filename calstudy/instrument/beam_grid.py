@@ -17,7 +17,6 @@ from pyuvdata import UVBeam
 from scipy.interpolate import make_interp_spline
 
 from calstudy.base.errors import InputError
-from calstudy.base.files import kept_while_unchanged
 
 POLARIZATIONS = {"x": -5, "y": -6}
 # HEALPix maps finer than this are put on a grid finer than one point per degree.
@@ -36,15 +35,8 @@ def read_beamfits(path: Path) -> UVBeam:
     Frequencies ascend, azimuths ascend from east within [0, 2 pi), and components are along azimuth and zenith angle,
     whatever the file has. Phases are those of the file, which must have the sign of `calstudy.instrument.tabulated`.
     Those of a power beam are lost: its field is the square root of the power, along the direction of the feed.
-    Raises InputError if the file is missing, cannot be read, has feeds other than x and y, or lacks a part of the sky.
+    Raises InputError if the file cannot be read, has feeds other than x and y, or lacks a part of the sky.
     """
-    if not path.is_file():
-        raise InputError(f"instrument.beam.path: there is no file {path}")
-    return _read(path)
-
-
-@kept_while_unchanged(2)
-def _read(path: Path) -> UVBeam:
     with warnings.catch_warnings():
         # Files of earlier versions lack metadata that pyuvdata now requires; those used here are checked below.
         warnings.simplefilter("ignore")

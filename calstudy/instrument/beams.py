@@ -35,6 +35,7 @@ HALVED = np.pi / 2 / 2 ** np.arange(1, 21)
 """Zenith angles, rad, between which adaptive quadrature begins: no beam in closed form is narrower than the last."""
 RESOLVED = 1e-4
 """Relative difference of solid angles on `ZENITH_ANGLES` and on every second of them, below which they are right."""
+CHANNELS_AT_A_TIME = 16
 
 TILE_DIPOLES = 4
 TILE_SPACING = 1.1
@@ -121,7 +122,7 @@ class ExactBeam:
         angles = []
         for frequency in frequencies:
             power = self._power(ZENITH_ANGLES, np.array([frequency]), feed)[0]
-            found, coarse = (np.array(integrate_power(power[::n], ZENITH_ANGLES[::n])) for n in (1, 2))
+            found, coarse = (integrate_power(power[::n], ZENITH_ANGLES[::n]) for n in (1, 2))
             # Also false for a beam so narrow that both are zero.
             if not (np.abs(found - coarse) < RESOLVED * found).all():
                 return self._adaptive_solid_angles(frequencies, feed)
@@ -179,22 +180,22 @@ def _solid_angles(
     table: TabulatedBeam | Tile, frequencies: tuple[float, ...], feed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     angles = []
-    for frequency in frequencies:
-        jones = table.jones(np.array([frequency]))[:, feed, 0]
+    for start in range(0, len(frequencies), CHANNELS_AT_A_TIME):
+        jones = table.jones(np.array(frequencies[start : start + CHANNELS_AT_A_TIME]))[:, feed]
         angles.append(integrate_power((np.abs(jones) ** 2).sum(axis=0), table.zenith_angles))
-    first, second = np.array(angles).T
+    first, second = np.concatenate(angles, axis=1)
     return first, second
 
 
-def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> tuple[float, float]:
-    """Return ∫A dΩ and ∫A² dΩ above the horizon, in sr.
+def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> np.ndarray:
+    """Return ∫A dΩ and ∫A² dΩ above the horizon, in sr, (2, ...).
 
-    A is on a grid of zenith angles, (Nza,), in radians, increasing from 0, and equally spaced azimuths, (Nza, Naz).
+    A is on a grid of zenith angles, (Nza,), in radians, increasing from 0, and equally spaced azimuths, (..., Nza,
+    Naz).
     """
     horizon = min(np.pi / 2, zenith_angles[-1])
-    rings = [2 * np.pi * np.sin(zenith_angles) * values.mean(axis=1) for values in (power, power**2)]
-    first, second = (float(CubicSpline(zenith_angles, ring).integrate(0, horizon)) for ring in rings)
-    return first, second
+    rings = [2 * np.pi * np.sin(zenith_angles) * values.mean(axis=-1) for values in (power, power**2)]
+    return np.array(CubicSpline(zenith_angles, rings, axis=-1).integrate(0, horizon))
 
 
 def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:

@@ -6,7 +6,7 @@ of the visibilities (`calstudy.instrument.beams`), in which an antenna at x_a ha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -39,18 +39,27 @@ DESCRIPTION = (
 def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
     """Make the zenith-pointed full embedded element beam of an MWA tile (Sokolowski et al. 2017).
 
-    Reading the file and fitting its table is slow, so the fit is kept for later processes. The default file is that of
-    `calstudy.base.package_files.BEAM`. `band` is the lowest and highest frequency in Hz; the margin that a fit needs is
-    read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file is missing or not of this band.
+    The default file is that of `calstudy.base.package_files.BEAM`. `band` is the lowest and highest frequency in Hz;
+    the margin that a fit needs is read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file
+    is missing or not of this band.
     """
-    path = BEAM.find() if path is None else path
+    return _of_file("mwa-beam", BEAM.find() if path is None else path, band, interpolation)
+
+
+def beamfits(path: Path, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
+    """Make the beam of a beamfits file; see `mwa_embedded_element`, and `read_beamfits` for what the file may have."""
+    return _of_file("beamfits", path, band, interpolation)
+
+
+def _of_file(kind: str, path: Path, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
+    """Make the beam of a file. Reading it and fitting its table is slow: the fit is kept for later processes."""
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
-    return _mwa_embedded_element(path, digest_file(path), band, interpolation)
+    return _fitted(kind, path, digest_file(path), band, interpolation)
 
 
-@lru_cache(maxsize=2)
-def _mwa_embedded_element(path: Path, digest: str, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
+@lru_cache(maxsize=4)
+def _fitted(kind: str, path: Path, digest: str, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
     decisive = {
         "file": digest,
         "band": band,
@@ -58,7 +67,7 @@ def _mwa_embedded_element(path: Path, digest: str, band: tuple[float, float], in
         "code": [digest_file(Path(source)) for source in (__file__, beam_frequencies.__file__, beam_grid.__file__)],
         "libraries": {name: version(name) for name in ("h5py", "numpy", "pyuvdata", "scipy")},
     }
-    fitted = kept_arrays("mwa-beam", decisive, lambda: fit_table(_read_mwa(path, band), band, interpolation))
+    fitted = kept_arrays(kind, decisive, lambda: fit_table(READERS[kind](path, band), band, interpolation))
     return TabulatedBeam({name: values if values.ndim else values.item() for name, values in fitted.items()})
 
 
@@ -72,6 +81,12 @@ def _read_mwa(path: Path, band: tuple[float, float]) -> UVBeam:
     # Its phases are +2 pi nu d.s / c.
     beam.data_array = beam.data_array.conj()
     return beam
+
+
+READERS: Mapping[str, Callable[[Path, tuple[float, float]], UVBeam]] = {
+    "mwa-beam": _read_mwa,
+    "beamfits": lambda path, _: beam_grid.read_beamfits(path),
+}
 
 
 def fit_table(table: UVBeam, band: tuple[float, float], interpolation: str) -> dict[str, Any]:

@@ -24,7 +24,15 @@ from calstudy.instrument.as_built import Misalignment
 from calstudy.instrument.beam_frequencies import mwa_frequencies
 from calstudy.instrument.beam_models.formulas import AiryBeam, DipoleBeam, GaussianBeam, MwaAnalyticBeam
 from calstudy.instrument.beam_models.tables import HERA_FILES, FileBeam, HeraBeam, MwaEmbeddedBeam
-from calstudy.instrument.beams import AZIMUTHS, ZENITH_ANGLES, ExactBeam, MwaTile, integrate_power, make_beam
+from calstudy.instrument.beams import (
+    AZIMUTHS,
+    ZENITH_ANGLES,
+    ExactBeam,
+    MwaTile,
+    _solid_angles,
+    integrate_power,
+    make_beam,
+)
 from calstudy.simulate.patterns import power_pattern
 
 CHANNELS = 167.075e6 + 320e3 * np.arange(96)
@@ -151,10 +159,10 @@ def test_the_kept_fit_of_the_embedded_element_is_the_fit(monkeypatch, tmp_path, 
         reads.append((path, wanted))
         return mwa_table.copy() if (path, wanted) == (BEAM.find(), band) else read(path, wanted)
 
-    monkeypatch.setattr(tabulated, "_read_mwa", counted)
+    monkeypatch.setitem(tabulated.READERS, "mwa-beam", counted)
     beams = []
     for _ in range(2):
-        tabulated._mwa_embedded_element.cache_clear()  # As in another process.
+        tabulated._fitted.cache_clear()  # As in another process.
         beams.append(tabulated.mwa_embedded_element(None, band, interpolation))
     assert len(reads) == 1
     fit = tabulated.TabulatedBeam(tabulated.fit_table(mwa_table, band, interpolation))
@@ -287,7 +295,7 @@ def test_few_tabulated_frequencies_limit_the_interpolation(tmp_path, embedded):
 def test_frequencies_outside_the_band_are_refused(embedded, mwa_table, monkeypatch):
     with pytest.raises(InputError, match="outside the band"):
         embedded.at(np.array([150e6]))
-    monkeypatch.setattr(tabulated, "_read_mwa", lambda *_: mwa_table)
+    monkeypatch.setitem(tabulated.READERS, "mwa-beam", lambda *_: mwa_table)
     with pytest.raises(InputError, match="not within"):
         make_beam(MwaEmbeddedBeam(), section.Channels(first="310 MHz"))
 
@@ -459,3 +467,21 @@ def test_hera_beams_are_those_of_their_files(model, frequency, pixels):
 
 def test_integral_of_an_isotropic_beam_is_the_hemisphere():
     assert integrate_power(np.ones((91, 12)), np.deg2rad(np.arange(91.0))) == pytest.approx((2 * np.pi, 2 * np.pi))
+
+
+def test_a_beam_of_a_file_is_fitted_and_integrated_once(tmp_path, embedded):
+    """Each power spectrum of a run makes the beam again; its solid angles would take longer than the spectrum."""
+    path = tmp_path / "beam.beamfits"
+    embedded.at(np.arange(166e6, 199.5e6, 1e6)).write_beamfits(path)
+    frequencies = np.linspace(170e6, 180e6, 40)
+    angles = []
+    for _ in range(2):
+        before = _solid_angles.cache_info().misses
+        angles.append(make_beam(FileBeam(kind="beamfits", path=path)).solid_angles(frequencies, "xx"))
+    assert _solid_angles.cache_info().misses == before
+    # Channels together, or one by one.
+    table = make_beam(FileBeam(kind="beamfits", path=path))._table
+    for place in (0, 17, 39):
+        power = (np.abs(table.jones(frequencies[place : place + 1])[:, 0, 0]) ** 2).sum(axis=0)
+        single = integrate_power(power, table.zenith_angles)
+        np.testing.assert_allclose(single, [first[place] for first in angles[0]], rtol=1e-12)

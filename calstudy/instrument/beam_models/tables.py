@@ -40,19 +40,15 @@ class _BeamfitsBeam(_TabulatedBeam, ABC):
 
     def require_usable(self, channels: Channels) -> None:
         """Read the file, and check that its frequencies enclose the channels."""
-        from calstudy.instrument.beam_grid import read_beamfits
-
-        choose_frequencies(read_beamfits(self._file()[0]).freq_array, channels.band, self.interpolation)
+        self.make(channels)
 
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band slightly wider than the channels'; it refuses frequencies outside."""
-        from calstudy.instrument.beam_grid import read_beamfits
         from calstudy.instrument.beams import GriddedBeam
-        from calstudy.instrument.tabulated import TabulatedBeam, fit_table
+        from calstudy.instrument.tabulated import beamfits
 
         path, name, what = self._file()
-        table = TabulatedBeam(fit_table(read_beamfits(path), channels.band, self.interpolation))
-        return GriddedBeam(table, name, STAND_IN.format(what=what))
+        return GriddedBeam(beamfits(path, channels.band, self.interpolation), name, STAND_IN.format(what=what))
 
 
 class FileBeam(_BeamfitsBeam):
