@@ -28,13 +28,17 @@ import dataclasses
 
 import numpy as np
 
-from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import KBins, PowerSettings
-from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum, bins_of_k, length_bins
-
-NEGLIGIBLE = 1e-3
-"""Correlations of powers below this are taken as zero."""
+from calstudy.power.spectra import (
+    NEGLIGIBLE,
+    CylindricalSpectrum,
+    DelaySpectra,
+    SphericalSpectrum,
+    bins_of_k,
+    length_bins,
+    signal_correlation,
+)
 
 
 def noise_level(noise: DelaySpectra) -> float:
@@ -85,7 +89,7 @@ def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.nda
 
     sigma_S falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
     """
-    first, second, correlation = _signal_correlation(spectra)
+    first, second, correlation = signal_correlation(spectra)
     return _effective_modes(spectra, bins, n_bins, (first, second, correlation)) * spectra.independent_times
 
 
@@ -116,32 +120,6 @@ def with_errors(
         noise_error = np.where(spectrum.n_modes > 0, noise / np.sqrt(spectrum.noise_modes), np.nan)
         sample_error = np.where(spectrum.n_modes > 0, amplitude / np.sqrt(spectrum.sample_modes), np.nan)
     return dataclasses.replace(spectrum, noise_error=noise_error, sample_error=sample_error)
-
-
-def _signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
-    from scipy.spatial import cKDTree
-
-    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / SPEED_OF_LIGHT) ** 2
-    reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
-    tree = cKDTree(spectra.vectors)
-    units = np.arange(len(spectra.vectors))
-    # V(-b) is the conjugate of V(b), its powers those at -tau: the same |k|.
-    close = [tree.query_pairs(reach, output_type="ndarray")]
-    opposite = tree.query_ball_point(-spectra.vectors, reach)
-    close.append(np.array([(i, j) for i, found in enumerate(opposite) for j in found if i < j]).reshape(-1, 2))
-    pairs = np.unique(np.concatenate(close).astype(int), axis=0)
-    first, second = pairs.T
-    distance = np.minimum(
-        np.linalg.norm(spectra.vectors[first] - spectra.vectors[second], axis=1),
-        np.linalg.norm(spectra.vectors[first] + spectra.vectors[second], axis=1),
-    )
-    correlation = np.exp(-rate * distance**2)
-    return (
-        np.concatenate([units, first, second]),
-        np.concatenate([units, second, first]),
-        np.concatenate([np.ones(units.size), correlation, correlation]),
-    )
 
 
 def _effective_modes(

@@ -4,9 +4,12 @@ A calibration changes a signal through its gains, and each gain acts on all base
 baselines, taken as independent, therefore understates the error of a sum over them. Errors here come from leaving out
 antennas.
 
-Let d_s be the deviation that each sample s (a baseline, or a redundant group) adds to a sum of mean zero, d_a that of
-all pairs of baselines that contain antenna a, w_a the part of the modes that these pairs have, and f_{sa} their part of
-the pairs of sample s. Leaving out antenna a moves the sum by d_a / (1 - w_a). Where deviations are
+Redundant baselines see the same sky, so that they are one sample, whether they are crossed with each other or each with
+itself (`calstudy.power.spectra.skies`).
+
+Let d_s be the deviation that each sample s adds to a sum of mean zero, d_a that of all pairs of baselines that contain
+antenna a, w_a the part of the modes that these pairs have, and f_{sa} their part of the pairs of sample s. Leaving out
+antenna a moves the sum by d_a / (1 - w_a). Where deviations are
 
 - due to the samples themselves, the variance of the sum is the sum of d_s^2 over the samples;
 - due to the N antennas, it is that of the jackknife, (N - 1) / N times the sum of (d_a / (1 - w_a))^2.
@@ -19,9 +22,10 @@ for n samples. For samples of one baseline and many antennas this is the sum of 
 an antenna in common, the variance of dyadic data (Fafchamps & Gubert 2007, J. Dev. Econ. 83, 326). The term of the
 antennas may be negative by chance, and is then taken as zero.
 
-Two cases are conservative. Deviations of single baselines within redundant groups have no term of their own: errors
-are then 1.2 to 1.6 times too large. And where gains are fitted to all baselines, the loss of all baselines together is
-fixed by the number of unknowns, which does not appear in any scatter.
+Three cases are conservative. Deviations of single baselines within redundant groups have no term of their own: errors
+are then 1.2 to 1.6 times too large. Where gains are fitted to all baselines, the loss of all baselines together is
+fixed by the number of unknowns, which does not appear in any scatter. And what differs between lengths of baselines in
+every sky counts as scatter.
 """
 
 from __future__ import annotations
@@ -30,7 +34,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calstudy.power.spectra import DelaySpectra, bins_of_k
+from calstudy.power.spectra import DelaySpectra, bins_of_k, skies
 
 LARGEST_PART = 0.5
 """Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""
@@ -60,10 +64,7 @@ class Clusters:
 
     @classmethod
     def of(cls, spectra: DelaySpectra, bins: np.ndarray, samples: np.ndarray, n_bins: int) -> Clusters:
-        """Find the sums from the bin, -1 for none, and the sample of each mode, (Nu, Nd) int each.
-
-        A sample has modes of one unit only.
-        """
+        """Find the sums from the bin, -1 for none, and the sample of each mode, (Nu, Nd) int each."""
         mode, (owner, _) = _number(bins, samples)
         unit = spectra.share_unit
         antenna = np.broadcast_to(spectra.share_antenna[:, None], (unit.size, bins.shape[1]))
@@ -186,10 +187,10 @@ def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
 
 
 def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:
-    """Return the clusters of the modes in bins of |k|, outside or inside the wedge; each unit is a sample.
+    """Return the clusters of the modes in bins of |k|, outside or inside the wedge; units of one sky are a sample.
 
     `edges` are as in `calstudy.power.spectra.bins_of_k`. Modes with |tau| <= |b|/c + `buffer` (s) are inside the wedge.
     """
     bins = bins_of_k(spectra, edges, buffer, inside)
-    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)
+    samples = np.broadcast_to(skies(spectra)[0][:, None], bins.shape)
     return Clusters.of(spectra, bins, samples, edges.size - 1)

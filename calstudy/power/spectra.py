@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.base.constants import SAME_LENGTH
+from calstudy.base.constants import SAME_LENGTH, SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import positions
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from hera_pspec import UVPSpec
 
 logger = logging.getLogger(__name__)
+
+NEGLIGIBLE = 1e-3
+"""Correlations of powers below this are taken as zero."""
+SAME_SKY = 0.9
+"""Units whose powers correlate by more see the same sky."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +114,50 @@ class DelaySpectra:
             share_pairs=self.share_pairs[shares],
             share_power=self.share_power[shares],
         )
+
+
+def signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
+    from scipy.spatial import cKDTree
+
+    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / SPEED_OF_LIGHT) ** 2
+    reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
+    tree = cKDTree(spectra.vectors)
+    units = np.arange(len(spectra.vectors))
+    # V(-b) is the conjugate of V(b), its powers those at -tau: the same |k|.
+    close = [tree.query_pairs(reach, output_type="ndarray")]
+    opposite = tree.query_ball_point(-spectra.vectors, reach)
+    close.append(np.array([(i, j) for i, found in enumerate(opposite) for j in found if i < j]).reshape(-1, 2))
+    pairs = np.unique(np.concatenate(close).astype(int), axis=0)
+    first, second = pairs.T
+    distance = np.minimum(
+        np.linalg.norm(spectra.vectors[first] - spectra.vectors[second], axis=1),
+        np.linalg.norm(spectra.vectors[first] + spectra.vectors[second], axis=1),
+    )
+    correlation = np.exp(-rate * distance**2)
+    return (
+        np.concatenate([units, first, second]),
+        np.concatenate([units, second, first]),
+        np.concatenate([np.ones(units.size), correlation, correlation]),
+    )
+
+
+def skies(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the sky that each unit sees, (Nu,) int, and whether at the opposite sign of the delay, bool.
+
+    Redundant baselines that are not crossed with each other, and all whose powers correlate by more than `SAME_SKY`,
+    directly or through others, see the same sky.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(spectra.vectors)
+    first, second, correlation = signal_correlation(spectra)
+    same = correlation > SAME_SKY
+    _, number = connected_components(coo_array((correlation[same], (first[same], second[same])), (count, count)))
+    _, start = np.unique(number, return_index=True)
+    reference = spectra.vectors[start[number]]
+    return number, np.sum(reference * spectra.vectors, axis=1) < 0
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ not flat make the projection oblique: it moves power between modes, which is in 
 smaller than T s^2. Between different baselines of a redundant group it is not such a fraction.
 
 Numerator and denominator contain the same sky, so that most of the sample variance cancels. The rest is estimated from
-the scatter of independent samples within a bin, where each baseline or redundant group is one sample (one patch of the
+the scatter of independent samples within a bin, where baselines that see the same sky are one sample (one patch of the
 uv plane, whose delays share the taper), and by leaving out antennas, for baselines share the gains of their antennas
 (`calstudy.power.clusters`).
 
@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins
+from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, skies
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class TransferFunction:
         baseline with itself it is the fraction of the power that is retained, but where power leaks in from other
         delays, as next to the wedge.
     signal : sum of P^S over the modes of the bin, each pair of baselines counting the same, (Nk,); NaN for empty bins
-    n_samples : baselines, or redundant groups, in each bin, (Nk,) int
+    n_samples : different baselines in each bin, redundant ones counting once, (Nk,) int
     flux_scale : s: fitted gain products over the true ones; NaN if not known
     """
 
@@ -310,7 +310,8 @@ def cylindrical_transfer(injection: Injection, length_bin: float) -> TransferMap
     column = np.abs(step)
     shape = (len(length_edges), column.max() + 1)
     bins = row[:, None] * shape[1] + column
-    samples = 2 * np.arange(row.size)[:, None] + (step < 0)
+    sky, opposite = skies(signal)
+    samples = 2 * sky[:, None] + ((step < 0) ^ opposite[:, None])
     clusters = Clusters.of(signal, bins, samples, shape[0] * shape[1])
     of_signal = clusters.powers(signal)
     transfer, cross_transfer = (

@@ -51,7 +51,7 @@ def gain_bias(graph: Graph) -> Task:
     )
 
 
-class ExpectGainBias(Task, stage="gain-bias", version=1):
+class ExpectGainBias(Task, stage="gain-bias", version=2):
     """The bias that an effect on the gains is expected to cause, by delay spectra of foregrounds and EoR."""
 
     effect: Bandpass

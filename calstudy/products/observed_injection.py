@@ -276,7 +276,7 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
         return _cost_of_average(self)
 
 
-class ObservedTransfer(Injected, stage="observed-transfer", version=5, cost=Cost(4, disk=1e6)):
+class ObservedTransfer(Injected, stage="observed-transfer", version=6, cost=Cost(4, disk=1e6)):
     """T of measured data; baselines of equal lengths share a bin since version 5."""
 
     def make(self, output: Path) -> Mapping[str, Any]:

@@ -82,7 +82,7 @@ class ScoreTable(StudyTable):
         return [score(graph)]
 
 
-class MeasureScore(Task, stage="score", version=4):
+class MeasureScore(Task, stage="score", version=5):
     """The scores in bins and in bands of k, and other numbers by which calibrators are compared."""
 
     power: PowerSettings

@@ -182,7 +182,7 @@ class Injected(Task):
         return [Table(columns, rows, "Signal loss", NOTE)]
 
 
-class Transfer(Injected, stage="transfer", version=5, cost=Cost(1, disk=1e6)):
+class Transfer(Injected, stage="transfer", version=6, cost=Cost(1, disk=1e6)):
     """T per k outside and inside the wedge and per (|b|, tau); equal lengths |b| share a bin since version 5."""
 
     scale: Input

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from gain_projection import projector, random
 
-from calstudy.power.clusters import Clusters
+from calstudy.power.clusters import Clusters, clusters_in_k
 from calstudy.power.delay import delays
-from calstudy.power.spectra import DelaySpectra
+from calstudy.power.spectra import DelaySpectra, skies
 
 ANTENNAS = 16
 PAIRS = np.array(list(itertools.combinations(range(ANTENNAS), 2)))
@@ -19,13 +19,14 @@ def spectra(power: np.ndarray, **shares: np.ndarray) -> DelaySpectra:
     """Spectra of given power, (Nu, Nd), at arbitrary delays."""
     units, count = power.shape
     return DelaySpectra(
-        power=power.astype(complex), vectors=np.ones((units, 3)), n_pairs=shares.pop("n_pairs", np.ones(units, int)),
+        power=power.astype(complex), vectors=shares.pop("vectors", np.ones((units, 3))),
+        n_pairs=shares.pop("n_pairs", np.ones(units, int)),
         n_polarizations=1, delay=delays(count, 1e5), k_perp=np.ones(units), k_parallel=np.arange(count) - count // 2,
         frequency=180e6, omega_pp=0.1, taper="none", **shares,
     )  # fmt: skip
 
 
-def of_baselines(power: np.ndarray, pairs: np.ndarray = PAIRS) -> DelaySpectra:
+def of_baselines(power: np.ndarray, pairs: np.ndarray = PAIRS, **more: np.ndarray) -> DelaySpectra:
     """Spectra of each baseline crossed with itself."""
     units = np.repeat(np.arange(len(pairs)), 2)
     return spectra(
@@ -34,6 +35,7 @@ def of_baselines(power: np.ndarray, pairs: np.ndarray = PAIRS) -> DelaySpectra:
         share_antenna=pairs.ravel(),
         share_pairs=np.ones(units.size, int),
         share_power=power[units].astype(complex),
+        **more,
     )
 
 
@@ -110,6 +112,33 @@ def test_errors_of_redundant_groups_hold_what_the_sky_and_what_antennas_do(share
         )  # fmt: skip
         draws.append(mean_and_error(found))
     assert quoted_over_true(draws) == AGREE
+
+
+@pytest.mark.parametrize("shared", [0.0, 1.0])
+def test_redundant_baselines_that_are_not_crossed_see_one_sky(shared):
+    """Baselines of a ring of antennas, each with itself: those of a group have a sky in common, and no antenna."""
+    first, steps = (axis.ravel() for axis in np.indices((ANTENNAS, ANTENNAS // 2 - 1)))
+    pairs = np.stack([first, (first + steps + 1) % ANTENNAS], axis=1)
+    # Half of them are written from the other end, and all are off by a centimetre.
+    signs = np.where(first % 2, 1, -1)
+    vectors = (14.0 * signs * (steps + 1))[:, None] * np.array([1.0, 0.0, 0.0])
+    vectors += np.random.default_rng(3).normal(scale=0.01, size=vectors.shape)
+    draws, alone = [], []
+    for seed in range(DRAWS):
+        rng = np.random.default_rng(seed)
+        power = rng.normal(size=(ANTENNAS // 2, 3))[steps] + shared * rng.normal(size=(ANTENNAS, 1))[pairs].sum(axis=1)
+        found = of_baselines(power + rng.normal(size=power.shape), pairs, vectors=vectors)
+        clusters = clusters_in_k(found, np.array([0.0, 10.0]), 0.0, inside=False)
+        assert clusters.n_samples == ANTENNAS // 2 - 1
+        value, error = clusters.powers(found).ratio(clusters.counts)
+        draws.append((float(value[0]), float(error[0])))
+        alone.append(mean_and_error(found))
+    number, opposite = skies(found)
+    assert len(set(zip(number.tolist(), steps.tolist(), strict=True))) == ANTENNAS // 2 - 1
+    assert np.array_equal(opposite, signs != signs[np.unique(number, return_index=True)[1]][number])
+    assert quoted_over_true(draws) == AGREE
+    # Where antennas scatter as well, less is missing.
+    assert quoted_over_true(alone) < (0.9 if shared else 0.5)
 
 
 @pytest.mark.parametrize(("part", "most"), [(0.3, 1.4), (1.0, 3.0)])

@@ -45,7 +45,7 @@ from calstudy.instrument.beams import make_beam
 from calstudy.power.average import fringe_stop_and_average
 from calstudy.power.clusters import Clusters
 from calstudy.power.interface import estimate_spectra
-from calstudy.power.spectra import DelaySpectra, outside_wedge
+from calstudy.power.spectra import DelaySpectra, outside_wedge, skies
 from calstudy.power.transfer import BANDS
 from calstudy.products import corruption, signal_loss, spectra
 from calstudy.products.files import DATA, read_visibilities
@@ -230,7 +230,7 @@ def budget(run: StepInput) -> list[Band]:
 def _mean(modes: DelaySpectra, used: np.ndarray, minus: Sequence[DelaySpectra] = ()) -> Finding:
     """Return the mean power of the chosen modes, each once per pair, and its error by leaving out antennas."""
     bins = np.where(used, 0, -1)
-    clusters = Clusters.of(modes, bins, np.broadcast_to(np.arange(len(bins))[:, None], bins.shape), 1)
+    clusters = Clusters.of(modes, bins, np.broadcast_to(skies(modes)[0][:, None], bins.shape), 1)
     power = clusters.powers(modes)
     for other in minus:
         power = power - clusters.powers(other)
