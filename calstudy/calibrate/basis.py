@@ -133,7 +133,7 @@ def channel_grid(frequencies: np.ndarray) -> ChannelGrid:
     Raises InputError if there are fewer than two channels, or if they do not lie on an even grid.
     """
     spacings = np.abs(np.diff(frequencies))
-    refusal = InputError("frequencies: the DPSS foreground basis needs at least two channels on an even grid")
+    refusal = InputError("frequencies: a fit by least squares needs at least two channels on an even grid")
     # Written so that frequencies that are not numbers are refused as well.
     if spacings.size == 0 or not spacings.min() > 0:
         raise refusal

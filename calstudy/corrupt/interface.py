@@ -184,7 +184,7 @@ def apply_effect(effect: Effect, visibilities: np.ndarray, observation: Observat
     shape = visibilities.shape
     with guarded(effect):
         changed = effect.apply(visibilities, observation, truth)
-    if not isinstance(changed, np.ndarray) or changed.shape != shape or changed.dtype.kind not in "fc":
+    if not isinstance(changed, np.ndarray) or changed.shape != shape or changed.dtype.kind != "c":
         raise InputError(
             f"effect {effect.label!r}: apply returned {_described(changed)}, expected complex of shape {shape}"
         )

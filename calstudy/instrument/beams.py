@@ -17,6 +17,7 @@ from scipy.integrate import quad_vec
 from scipy.interpolate import CubicSpline
 
 from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.errors import InputError
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.plugins import Plugin, guarded
@@ -202,11 +203,19 @@ def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:
     """Return the beam of the `instrument.beam` section, by default for the channels of the paper.
 
     Tabulated beams are read and fitted over a slightly wider band than the channels, and do not accept frequencies
-    outside it. Raises InputError if a beam file is missing, cannot be read, or does not cover the channels.
+    outside it. Raises InputError if a beam file is missing, cannot be read, or does not cover the channels, or if a
+    plug-in makes something else.
     """
     channels = Channels() if channels is None else channels
     with guarded(settings):
         beam = model_of(settings).make(channels)
+    missing = [name for name in ("name", "stand_in", "at", "solid_angles") if not hasattr(beam, name)]
+    if missing:
+        hint = "; wrap it in calstudy.instrument.beams.ExactBeam" if isinstance(beam, AnalyticBeam) else ""
+        raise InputError(
+            f"instrument.beam = {settings.label!r}: make returned {type(beam).__name__}, which is no beam: it has no "
+            f"{missing[0]!r}{hint}"
+        )
     if not isinstance(beam, ExactBeam):
         return beam
     # All spectra of a run have the same beam, whose solid angles take longer than a small spectrum.

@@ -225,8 +225,8 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
     ]
     lost = sum(record["status"] not in USABLE for record in records) / len(records)
     without = [
-        f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost: errors by the noise of spectra "
-        "of simulations count them, and are too small by as much"
+        f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost; in a simulation, errors of "
+        "spectra by noise count them, and are too small by as much"
     ]
     return (
         (stalled if "stalled" in by_status else [])

@@ -29,6 +29,7 @@ from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult, Solve
+    from calstudy.products.selection import Gains
 
 
 ERRORS = "gain-errors.json"
@@ -286,8 +287,11 @@ def gain_coverage(graph: Graph, variant: Variant, parity: str) -> Task:
     return MeasureCoverage(f"coverage {parity}", gains=true, **solved(graph, variant, parity))
 
 
-class MeasureCoverage(OfSolves, stage="gain-coverage", version=3):
-    """Fractions of the gains of each solve that are within their errors of the true gains, unity if there are none."""
+class MeasureCoverage(OfSolves, stage="gain-coverage", version=4):
+    """Fractions of the gains of each solve that are within their errors of the true gains, unity if there are none.
+
+    The true gains of integrations that are solved together are their mean.
+    """
 
     gains: Input = None
 
@@ -296,13 +300,19 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=3):
         from calstudy.products.selection import read_gains
 
         result, found, reasons = read_result(self.calibration), [], []
-        true = None if self.gains is None else read_gains(self.gains)
+        true: dict[int, Gains] = {}
         for solve in self.solves(result):
             if isinstance(solve.errors, str):
                 reasons.append(solve.errors)
                 continue
             numbers = result.gains.ant_array[solve.rows]
-            reference = np.ones(solve.gains.shape) if true is None else true.at(solve.times.start, numbers)
+            reference = np.ones(solve.gains.shape)
+            if self.gains is not None:
+                if solve.place not in true:
+                    true[solve.place] = read_gains(self.gains, solve.place)
+                of_feed = true[solve.place]
+                together = range(solve.times.start, solve.times.stop)
+                reference = np.mean([of_feed.at(time, numbers) for time in together], axis=0)
             found.append(pulls(solve.errors, solve.gains, reference))
         if not found:
             raise InputError(f"no errors of gains: {'; '.join(sorted(set(reasons)))}")

@@ -124,7 +124,7 @@ def noise_power(graph: MeasuredGraph, what: str, source: str) -> Task:
     return cross_power(graph, noise.label, [noise, noise], own)
 
 
-class Observe(Task, stage="observe", version=5):
+class Observe(Task, stage="observe", version=6):
     """The data of one part, and the sky model.
 
     The noise is that of a sample with nsamples of one since version 2, and has the mean of inverse variances since 3.

@@ -142,12 +142,13 @@ def read_facts(
     baselines, or `even` is not satisfied.
     """
     # Plans of simulations need other parts of this module, and pyuvdata takes long to import.
-    from calstudy.realdata.reading import place_antennas, read_metadata, share_times
+    from calstudy.realdata.reading import place_antennas, read_metadata, share_orientation, share_times
 
     data = read_metadata(paths)
     if positions is not None:
         place_antennas(data, positions)
     data = select(data, replace(selection, times=None))
+    share_orientation(data)
     share_times(data, [])
     # Baselines without samples at the selected times are filled with flagged ones.
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)

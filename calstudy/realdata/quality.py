@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 GAIN_FACTOR = 5.0
 # Means of pure noise over many samples scatter by a few per cent.
 CHI2_FACTOR = 3.0
+ABSORBED = 0.01
+"""chi^2 per sample below which a fit has nothing left to compare: one with room for noise has its share of it."""
 INTERFERENCE = (
     "interference? (--flag-interference, observed.flag_interference: true; if it is on, select a quieter band)"
 )
@@ -93,11 +95,15 @@ class Quality:
                 "|g| is far below that of the other antennas", "1/", antennas, inverse, GAIN_FACTOR, "a dead one?"
             ),
         ]
-        for names, values in (
+        level = _median(self.chi2_by_antenna)
+        if level < ABSORBED:
+            found.append(f"chi^2 is {level:.1g} per sample: the fit has about as many unknowns as there are samples")
+        compared = (
             (channels, self.chi2_by_channel),
             (antennas, self.chi2_by_antenna),
             (integrations, self.chi2_by_integration),
-        ):
+        )
+        for names, values in () if level < ABSORBED else compared:
             found.append(_sentence("chi^2 is far above the median", "x", names, values / _median(values), CHI2_FACTOR))
         return [f"{self.polarization}: {sentence}" for sentence in found if sentence]
 

@@ -138,6 +138,7 @@ def prepare(data: UVData, selection: Selection = EVERYTHING, x: str = "east") ->
     if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
         data.unproject_phase()
         notes.append("The data were phased to a source; they are calibrated, and written, as a drift scan.")
+    share_orientation(data)
     share_times(data, notes)
     data.reorder_freqs(channel_order="freq", spw_order="freq", run_check=False)
     _require_ascending(np.ravel(data.freq_array))
@@ -199,6 +200,20 @@ def _require_ascending(frequencies: np.ndarray) -> None:
             f"data: spectral windows overlap: one ends at {end:.3f} MHz, and the next starts at {start:.3f} MHz; "
             "channels must ascend: select those of one window by --select frequencies"
         )
+
+
+def share_orientation(data: UVData) -> None:
+    """Turn baselines that are from a to b in some samples, and from b to a in others, to one direction.
+
+    Files of programs with different conventions have them. `data` may be only metadata.
+    """
+    first, second = np.asarray(data.ant_1_array), np.asarray(data.ant_2_array)
+    _, baseline = np.unique(np.sort(np.column_stack([first, second]), axis=1), axis=0, return_inverse=True)
+    baseline = baseline.ravel()
+    turned = first > second
+    mixed = np.intersect1d(baseline[turned], baseline[~turned])
+    if mixed.size:
+        data.conjugate_bls(np.flatnonzero(turned & np.isin(baseline, mixed)))
 
 
 def share_times(data: UVData, notes: list[str]) -> None:

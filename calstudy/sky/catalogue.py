@@ -170,10 +170,11 @@ def _points(names: np.ndarray, directions: SkyCoord, flux: np.ndarray, spectrum:
 def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     """Read point sources from a CSV file with a header line; rows without a position or flux density are left out.
 
-    The columns are right ascension and declination (ICRS, degrees), flux density (Jy) and spectral index. Raises
-    ValueError if a column is missing or not numeric, there is no source, or a source has no spectral index.
+    Lines that begin with # are comments. The columns are right ascension and declination (ICRS, degrees), flux density
+    (Jy) and spectral index. Raises ValueError if a column is missing or not numeric, there is no source, or a source
+    has no spectral index.
     """
-    table = Table.read(path, format="ascii.csv")
+    table = Table.read(path, format="ascii.csv", comment="#")
     wanted = {key: getattr(columns, key) for key in ("right_ascension", "declination", "flux", "spectral_index")}
     named = {key: name for key, name in wanted.items() if name is not None}
     missing = [name for name in named.values() if name not in table.colnames]

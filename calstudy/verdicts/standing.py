@@ -5,9 +5,10 @@ In a band of k, a calibrator
 - *passes* in a world if its bias is below the limit by two standard deviations, |bias| + 2 sigma < limit, and T is
   measured,
 - *fails* if it is above by two standard deviations, if T is not that of a solution (below -0.1 or above 1.2 by more
-  than two standard deviations), or if the calibrator cannot work there,
-- is *open* otherwise: the errors of this run are too large to tell. Without a bias, the measured one is about sigma,
-  so that 3 sigma must be below the limit to show it.
+  than two standard deviations), if it keeps nothing (T is below 0.05 by two standard deviations: what removes all has
+  no bias), or if the calibrator cannot work there,
+- is *open* otherwise: the errors of this run are too large to tell, or no solve converged. Without a bias, the measured
+  one is about sigma, so that 3 sigma must be below the limit to show it.
 
 It passes the comparison if it passes in all worlds, and fails if it fails in one. The bias and its error are those of
 the scores, in units of the EoR.
@@ -31,6 +32,8 @@ from typing import Any, Literal
 from calstudy.base.table import Table, two_digits
 
 LOWEST, HIGHEST = -0.1, 1.2
+LEAST = 0.05
+"""A calibrator that keeps less of the EoR keeps nothing."""
 LARGEST_ERROR = 0.3
 """Standard deviation above which T is not measured."""
 
@@ -99,13 +102,18 @@ class InWorld:
 
     def standing(self, limit: float) -> Standing:
         """Return whether the bias is below the limit."""
-        if self.refused or self._is_no_solution:
+        if self.refused or self._is_no_solution or self._keeps_nothing:
             return "fails"
         # With NaN, no comparison is true.
         if abs(self.bias) - SIGMAS * self.bias_error > limit:
             return "fails"
-        known = is_measured(self.transfer, self.transfer_error)
+        known = is_measured(self.transfer, self.transfer_error) and self.has_solution
         return "passes" if known and self.upper_limit < limit else "open"
+
+    @property
+    def has_solution(self) -> bool:
+        """Whether a solve ended at a solution, as far as is known."""
+        return not self.solves or settled(self.solves) > 0
 
     @property
     def kept(self) -> float:
@@ -121,6 +129,10 @@ class InWorld:
         return self.transfer + margin < LOWEST or self.transfer - margin > HIGHEST
 
     @property
+    def _keeps_nothing(self) -> bool:
+        return self.kept + SIGMAS * self.transfer_error < LEAST
+
+    @property
     def upper_limit(self) -> float:
         """Size of the bias that is excluded with 95 %."""
         return upper_limit(self.bias, self.bias_error)
@@ -131,6 +143,8 @@ class InWorld:
         if self.refused:
             return f"{self.world} (cannot work)"
         name, value = ("T", self.transfer) if self._is_no_solution else ("bias", self.bias)
+        if self._keeps_nothing:
+            name, value = "T", self.kept
         return f"{self.world} ({name} {two_digits(value)})"
 
 
@@ -205,7 +219,8 @@ class InBand:
         smaller = (SIGMAS + 1) * max(large, default=0.0) / self.limit
         cause = f"errors {smaller:.1f} times smaller would tell" if smaller > AT_LIMIT else "the bias is near the limit"
         cause = f"errors would have to be over {OUT_OF_REACH:g} times smaller" if smaller > OUT_OF_REACH else cause
-        cause = cause if large else "T is not measured there"
+        unsolved = all(is_measured(world.transfer, world.transfer_error) for world in decisive)
+        cause = cause if large else "no solve converged there" if unsolved else "T is not measured there"
         if not all(math.isfinite(world.upper_limit) for world in decisive):
             cause = "a wider band of k, or more baselines, would tell"
         return f"open in {len(decisive)} of {len(self.worlds)} worlds: {self.numbers}; {cause}"

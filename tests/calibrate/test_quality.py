@@ -112,6 +112,12 @@ def test_with_autocorrelations_chi2_is_in_units_of_the_radiometer_equation(clean
     found = assess(data, result_of(clean, 2 * sigma * normal(clean)))
     assert "radiometer" in found.noise
     assert np.nanmean(found.chi2_by_channel) == pytest.approx(4, rel=6 / np.sqrt(clean.data_array.size))
+    assert found.warnings == []
+    # Two antennas have a gain each in every channel, and one baseline: what is left is rounding.
+    absorbed = normal(clean)
+    absorbed[:, :, CHANNEL] *= 4
+    (warning,) = assess(data, result_of(clean, 1e-4 * sigma * absorbed)).warnings
+    assert "chi^2 is 1e-08 per sample: the fit has about as many unknowns as there are samples" in warning
 
 
 def test_a_selection_of_lengths_keeps_the_autocorrelations_that_weights_need(clean):

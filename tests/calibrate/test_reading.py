@@ -46,6 +46,27 @@ def test_any_order_becomes_time_major(data, order):
     prepared.check()
 
 
+def test_baselines_that_are_reversed_in_some_samples_have_one_direction(data, tmp_path):
+    """Each program has its own convention, and a night may have files of two."""
+    mixed = data.copy()
+    crosses = np.flatnonzero((mixed.ant_1_array != mixed.ant_2_array) & (mixed.time_array > mixed.time_array.min()))
+    mixed.conjugate_bls(crosses[np.random.default_rng(4).random(crosses.size) < 0.5])
+    prepared, notes = prepare(mixed)
+    assert notes == []
+    assert np.array_equal(antenna_pairs(prepared), antenna_pairs(data))
+    assert np.allclose(to_cube(prepared), to_cube(data), rtol=1e-12)
+    assert np.allclose(prepared.uvw_array, data.uvw_array)
+    path = tmp_path / "mixed.uvh5"
+    # pyuvdata takes the samples for a table of times and baselines still.
+    mixed.blts_are_rectangular = False
+    mixed.write_uvh5(path)
+    assert read_facts((path,), Selection()).frame.n_baselines == len(antenna_pairs(data))
+    # Those that are reversed in all samples are left as they are.
+    data.conjugate_bls(np.arange(data.Nblts))
+    kept = antenna_pairs(prepare(data)[0])
+    assert np.array_equal(kept[:, ::-1], sorted(antenna_pairs(prepared).tolist(), key=lambda pair: pair[::-1]))
+
+
 def test_missing_samples_are_flagged(data):
     keep = np.delete(np.arange(data.Nblts), [3, 40, 41])
     prepared, notes = prepare(data.select(blt_inds=keep, inplace=False))

@@ -59,6 +59,8 @@ def test_a_run_of_a_known_sky_is_covered(tmp_path):
         "calibration": {"calibrator": "sky-based", "weights": "flags", "chunks": 1},
         "corruption.noise": {"kind": "times-foregrounds", "factor": 0.01},
         "instrument.times.count": 4,
+        # The gains of both feeds differ.
+        "instrument.polarizations": ["xx", "yy"],
         "variants": {"residual": {"components": ["foregrounds", "noise"], "effects": True, "calibrate": True}},
         "outputs.figures": ["gain-coverage"],
     }.items():
@@ -66,7 +68,7 @@ def test_a_run_of_a_known_sky_is_covered(tmp_path):
     result = run_study(ExperimentStudy(validate(data, Path())), Budget(workers=1), Console(file=io.StringIO()))
     table = result.folder / "figures" / "gain-coverage.csv"
     head, *rows = (line.split(",") for line in table.read_text().splitlines())
-    assert [row[:3] for row in rows] == [["", "amplitude", "8"], ["", "phase", "8"]]
+    assert [row[:3] for row in rows] == [["", "amplitude", "16"], ["", "phase", "16"]]
     for name, (right, allowed) in zip(("within 1 sigma [%]", "within 1.96 sigma [%]"), ALLOWED, strict=True):
         assert [float(row[head.index(name)]) for row in rows] == pytest.approx([100 * right] * 2, abs=100 * allowed)
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from plugin_files import Plugged, make
 
-from calstudy.base.errors import ExperimentError
+from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
+from calstudy.experiment.files import validate
 from calstudy.instrument.beams import make_beam
 from calstudy.products import corruption, simulation, spectra
 from calstudy.products.files import read_visibilities
@@ -64,3 +65,24 @@ def test_a_simulation_is_that_of_the_same_built_in_beam(plugged):
     beams = [make_beam(experiment.instrument.beam, experiment.instrument.channels) for experiment in experiments]
     angles = [beam.solid_angles(np.array([170e6, 180e6]), "xx") for beam in beams]
     np.testing.assert_allclose(*angles, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("result", "told"),
+    [
+        ("None", "make returned NoneType, which is no beam: it has no 'name'$"),
+        (
+            "GaussianBeam(sigma=0.1)",
+            r"returned GaussianBeam, .*; wrap it in calstudy\.instrument\.beams\.ExactBeam$",
+        ),
+    ],
+)
+def test_what_is_no_beam_is_refused(tmp_path, result, told):
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from pyuvdata.analytic_beam import GaussianBeam\nfrom calstudy.instrument.interface import BeamModel\n\n"
+        f"class Own(BeamModel):\n    def make(self, channels):\n        return {result}\n"
+    )
+    settings = validate({"name": "own", "instrument": {"beam": str(path)}}, tmp_path).instrument
+    with pytest.raises(InputError, match=told):
+        make_beam(settings.beam, settings.channels)

@@ -122,6 +122,10 @@ class Short(Effect):
     def apply(self, visibilities, observation, truth):
         return visibilities[:1, :2]
 
+class Real(Effect):
+    def apply(self, visibilities, observation, truth):
+        return abs(visibilities)
+
 class Spoiling(Effect):
     def apply(self, visibilities, observation, truth):
         return visibilities * np.nan
@@ -153,6 +157,7 @@ def test_an_effect_that_does_nothing_is_refused(tmp_path):
     ("name", "told"),
     [
         ("Raising", r"broken\.py line 8, in apply: KeyError: 'nothing'"),
+        ("Real", "effect 'Real': apply returned an array of float64 of shape .*, expected complex"),
         ("Exiting", r"broken\.py line 12, in apply: it ended the process \(sys\.exit, status 3\)"),
         ("Short", r"effect 'Short': apply returned an array of complex128 of shape \(1, 2, 32, 1\), expected"),
         ("Spoiling", "effect 'Spoiling': apply returned visibilities that are not finite"),

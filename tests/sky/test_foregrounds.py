@@ -337,7 +337,7 @@ CSV = {"right_ascension": "ra", "declination": "dec", "flux": "s", "frequency": 
 
 def test_a_csv_is_read_by_the_columns_named(tmp_path):
     path = tmp_path / "mine.csv"
-    path.write_text("dec,s,ra,alpha\n-30.0,1.5,10.0,-1.0\n-20.0,3.0,20.0,0.5\n-10.0,,30.0,0.0\n")
+    path.write_text("# by hand\ndec,s,ra,alpha\n-30.0,1.5,10.0,-1.0\n-20.0,3.0,20.0,0.5\n-10.0,,30.0,0.0\n")
     flat = make_foregrounds(section.FileSources(kind="file", path=path, csv=CSV), FREQUENCIES)
     assert flux(flat.sky) == pytest.approx([1.5, 3.0])
     assert flat.sky.skycoord.icrs.dec.deg == pytest.approx([-30.0, -20.0])

@@ -58,6 +58,21 @@ def test_what_is_kept_is_no_more_than_the_linear_response_says():
     assert kept == {None: 0.8, 0.6: 0.6, 0.795: 0.8, 0.9: 0.8}
 
 
+def test_what_removes_the_eor_with_all_else_does_not_pass():
+    """It has no bias, and nothing is left to be measured."""
+    assert standing_of(case(0.0, 0.001, transfer=0.01)).standing == "fails"
+    assert str(standing_of(case(0.0, 0.001, transfer=0.01))) == "fails in ideal (T 0.01)"
+    assert standing_of(case(0.0, 0.01, transfer=0.04)).standing == "passes"
+    assert "take" not in " ".join(advice(standings({"w": {"name": case(0.0, 0.001, transfer=0.0)}})))
+
+
+def test_numbers_of_solves_that_all_stalled_do_not_pass():
+    found = standing_of({**case(0.0, 0.001), "by_status": {"stalled": 4}})
+    assert found.standing == "open"
+    assert str(found).endswith("4 of 4 solves not converged; no solve converged there")
+    assert standing_of({**case(0.0, 0.001), "by_status": {"stalled": 3, "converged": 1}}).standing == "passes"
+
+
 def test_the_worst_world_decides_and_is_named():
     good, bad = case(0.0, 0.01), case(44.0, 9.0)
     assert standing_of(good, good).standing == "passes"
