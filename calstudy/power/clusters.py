@@ -7,25 +7,24 @@ antennas.
 Redundant baselines see the same sky, so that they are one sample, whether they are crossed with each other or each with
 itself (`calstudy.power.spectra.skies`).
 
-Let d_s be the deviation that each sample s adds to a sum of mean zero, d_a that of all pairs of baselines that contain
-antenna a, w_a the part of the modes that these pairs have, and f_{sa} their part of the pairs of sample s. Leaving out
-antenna a moves the sum by d_a / (1 - w_a). Where deviations are
+Let d_s be the deviation that each sample s adds to a sum of mean zero, d_{sa} that of its pairs of baselines that
+contain antenna a, d_a that of all pairs that do, and w_a the part of the modes that these have. Leaving out antenna a
+moves the sum by d_a / (1 - w_a). Where deviations are
 
 - due to the samples themselves, the variance of the sum is the sum of d_s^2 over the samples;
 - due to the N antennas, it is that of the jackknife, (N - 1) / N times the sum of (d_a / (1 - w_a))^2.
 
-The second counts the first as well, f_{sa}^2 of it for each antenna of a sample. This is subtracted, so that
+The second counts again what pairs of one sample have in common that share an antenna. This is subtracted, so that
 
-    var = n / (n - 1) sum_s d_s^2 + (N - 1) / N sum_a [d_a^2 - sum_s (f_{sa} d_s)^2] / (1 - w_a)^2
+    var = n / (n - 1) sum_s d_s^2 + (N - 1) / N sum_a [d_a^2 - sum_s d_{sa}^2] / (1 - w_a)^2
 
-for n samples. For samples of one baseline and many antennas this is the sum of d_s d_t over all baselines s and t with
-an antenna in common, the variance of dyadic data (Fafchamps & Gubert 2007, J. Dev. Econ. 83, 326). The term of the
-antennas may be negative by chance, and is then taken as zero.
+for n samples: the sum of the products of the deviations of all pairs that are of one sample or have an antenna in
+common. For samples of one baseline and many antennas this is the variance of dyadic data (Fafchamps & Gubert 2007, J.
+Dev. Econ. 83, 326). The term of the antennas may be negative by chance, and is then taken as zero.
 
-Three cases are conservative. Deviations of single baselines within redundant groups have no term of their own: errors
-are then 1.2 to 1.6 times too large. Where gains are fitted to all baselines, the loss of all baselines together is
-fixed by the number of unknowns, which does not appear in any scatter. And what differs between lengths of baselines in
-every sky counts as scatter.
+Two cases are conservative. Where gains are fitted to all baselines, the loss of all baselines together is fixed by the
+number of unknowns, which does not appear in any scatter. And what differs between lengths of baselines in every sky
+counts as scatter.
 """
 
 from __future__ import annotations
@@ -159,8 +158,7 @@ def linear_error(terms: tuple[tuple[np.ndarray, Sums], ...]) -> np.ndarray:
     owner, _, antenna = _combinations(share_owner, clusters.share_antenna)
     part = np.bincount(antenna, clusters.share_weight) / np.bincount(clusters.owner, clusters.weight)[owner]
     left = 1 - np.minimum(part, LARGEST_PART)
-    own = clusters.share_weight / clusters.weight[clusters.share_sample] * samples[clusters.share_sample]
-    moved = (np.bincount(antenna, shares) ** 2 - np.bincount(antenna, own**2)) / left**2
+    moved = (np.bincount(antenna, shares) ** 2 - np.bincount(antenna, shares**2)) / left**2
     antennas = np.maximum(np.bincount(owner, minlength=count.size), 1)
     by_antennas = (antennas - 1) / antennas * np.bincount(owner, moved, count.size)
     return np.sqrt(variance + np.maximum(by_antennas, 0.0))
