@@ -88,10 +88,11 @@ LEAST_TAPER = 1e-4
 RUNAWAY = 1.0
 """Weights that change by more than themselves in the last pass run away; the result is that of equal weights then.
 
-Unlike calibrators of other packages, fits of our own do not go half of the way. Where noise makes weights run away, half
-steps settle at gains that are no better than those of equal weights (HERA-19, k of 0.3 to 0.5: T of 0.91 +- 0.23, with
-equal weights 0.88 +- 0.04). Where the sky model lacks most they are far better (`calstudy which hera-19`, sky-based,
-diffuse emission unknown: bias of 0.5 in place of 8e5 at k of 0.5 to 1). How a fit tells the two apart is open.
+Unlike calibrators of other packages, fits of our own do not go half of the way. Where noise makes weights run away,
+half steps settle at gains that are no better than those of equal weights (HERA-19, k of 0.3 to 0.5: T of 0.91 +- 0.23,
+with equal weights 0.88 +- 0.04). Where the sky model lacks most they are far better (`calstudy which hera-19`,
+sky-based, diffuse emission unknown: bias of 0.5 in place of 8e5 at k of 0.5 to 1). How a fit tells the two apart is
+open.
 """
 
 
