@@ -74,6 +74,24 @@ MUTATIONS = (
         CORRUPTION,
     ),
     Mutation(
+        "redundant baselines as independent skies",
+        "    samples = np.broadcast_to(skies(spectra)[0][:, None], bins.shape)\n",
+        "    samples = np.broadcast_to(np.arange(len(bins))[:, None], bins.shape)\n",
+        ("tests/power/test_clusters.py",),
+    ),
+    Mutation(
+        "noise of redundant baselines counted again by antennas",
+        "np.bincount(antenna, shares**2)) / left**2",
+        "0) / left**2",
+        ("tests/power/test_clusters.py",),
+    ),
+    Mutation(
+        "a fit that removes the EoR passes",
+        "or self._is_no_solution or self._keeps_nothing:",
+        "or self._is_no_solution:",
+        ("tests/verdicts/test_standing.py",),
+    ),
+    Mutation(
         "passes of weights that swing go all of the way",
         "            used = np.where(changes > SLOW * before, _halfway(used, solved.gains), solved.gains)\n",
         "            used = solved.gains\n",
