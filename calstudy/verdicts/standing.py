@@ -142,9 +142,9 @@ class InWorld:
         """The world with the number for which a calibrator fails there."""
         if self.refused:
             return f"{self.world} (cannot work)"
-        name, value = ("T", self.transfer) if self._is_no_solution else ("bias", self.bias)
-        if self._keeps_nothing:
-            name, value = "T", self.kept
+        name, value = "bias", self.bias
+        if self._is_no_solution or self._keeps_nothing:
+            name, value = "T", self.transfer if self._is_no_solution else self.kept
         return f"{self.world} ({name} {two_digits(value)})"
 
 

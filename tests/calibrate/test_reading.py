@@ -57,7 +57,7 @@ def test_baselines_that_are_reversed_in_some_samples_have_one_direction(data, tm
     assert np.allclose(to_cube(prepared), to_cube(data), rtol=1e-12)
     assert np.allclose(prepared.uvw_array, data.uvw_array)
     path = tmp_path / "mixed.uvh5"
-    # pyuvdata takes the samples for a table of times and baselines still.
+    # pyuvdata still takes every baseline to be there at every time.
     mixed.blts_are_rectangular = False
     mixed.write_uvh5(path)
     assert read_facts((path,), Selection()).frame.n_baselines == len(antenna_pairs(data))
