@@ -104,8 +104,9 @@ class CalamityRedundant(_LeastSquares, ForegroundFit):
     """Gains are fitted with a smooth foreground model of each redundant group (paper Eq. LOGLIKELIHOODREDUNDANT)."""
 
     # Foregrounds are modelled between the flagged edges of the band since 2. Where weights run away, the result is that
-    # of equal weights since 3, in every integration.
-    version: ClassVar[int] = 3
+    # of equal weights since 3, in every integration. Where few baselines are redundant, weights of own gains settle
+    # since 4, with another preconditioner.
+    version: ClassVar[int] = 4
     calibrator: str = "calamity-redundant"
     foreground_prior: ForegroundPrior = ForegroundPrior(deviation=0.0, shared_deviation="infinite")
 

@@ -3,9 +3,9 @@
 Each step solves the damped normal equations of the reduced problem (`calstudy.calibrate.solvers.reduced`) by
 preconditioned conjugate gradients, with the damping proportional to the loss, so that it vanishes towards the minimum.
 The first two steps of a cold start use the antenna blocks of each channel as preconditioner, all others the channel
-blocks of each antenna, which also predict the decrease of the loss that is still possible. Where baselines share models
-without a finite prior, the couplings between antennas remain the strong ones, and antenna blocks of each channel are
-used throughout.
+blocks of each antenna, which also predict the decrease of the loss that is still possible. Where more than a few
+baselines share models without a finite prior, the couplings between antennas remain the strong ones, and antenna blocks
+of each channel are used throughout.
 
 With a finite prior the damping is smaller. It then stays raised after a step that did not lower the loss, and falls
 again as steps achieve their predicted decrease. Directions that foregrounds can nearly follow have a curvature from the
