@@ -113,7 +113,7 @@ def test_an_array_without_redundancy_loses_the_calibrator_that_needs_it():
 
 
 @pytest.mark.chain
-def test_a_run_ends_with_an_answer(positions, capsys):
+def test_a_run_ends_with_an_answer(positions, tmp_path, capsys):
     tiny = (
         "instrument.channels.count=32",
         "sky.foregrounds.count=200",
@@ -123,10 +123,12 @@ def test_a_run_ends_with_an_answer(positions, capsys):
         "figures=[comparison-matrix]",
     )
     changes = [text for change in tiny for text in ("--set", change)]
-    options = ("--site", "mwa", "--beam", "gaussian", "--workers", "1")
+    options = ("--site", "mwa", "--beam", "gaussian", "--workers", "1", "--output", "answers")
     status, written = run_and_read(capsys, "which", positions, *options, *changes)
     assert status == 0
     assert "6 antennas (csv)" in written.out
     # The missing half is far more than the EoR, and a fit of gains alone leaves it in the data.
     assert "Bias below 0.1 of the EoR in all 2 worlds?" in written.out
     assert "fails in half known" in " ".join(written.out.split())
+    (folder,) = (tmp_path / "answers").iterdir()
+    assert (folder / "figures" / "comparison-matrix.png").is_file()

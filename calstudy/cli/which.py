@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from calstudy.cli.options import MaxMemory, Scale, Set, Workers, named_as_options
+from calstudy.cli.options import MaxMemory, Runs, Scale, Set, Workers, named_as_options, with_runs
 
 BEAMS = {"hera": "hera", "mwa": "mwa-embedded-element"}
 """Beams of the antennas of sites."""
@@ -54,6 +54,7 @@ def which(
     beam: Beam = None,
     scale: Scale = None,
     overrides: Set = None,
+    output: Runs = None,
     workers: Workers = None,
     max_memory: MaxMemory = None,
     dry_run: Plan = False,
@@ -70,7 +71,7 @@ def which(
     from calstudy.studies.show import describe_plan, show_plan, show_run
     from calstudy.studies.study import run_study
 
-    changes = [*array_changes(layout, site, beam), *(overrides or ())]
+    changes = [*array_changes(layout, site, beam), *with_runs(overrides, output)]
     console, budget = Console(soft_wrap=True, highlight=False), Budget(workers, max_memory)
     with named_as_options(_in_options):
         # The file is not the user's, and names no others: paths are those of options.

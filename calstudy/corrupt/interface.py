@@ -158,8 +158,23 @@ def require_usable(effects: Sequence[Effect], size: Size) -> None:
 def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:
     """Return the truth of an effect for an observation, checked; the same settings and observation give the same bits.
 
-    Raise InputError if the effect refuses, fails, or returns anything but arrays of numbers by name.
+    Raise InputError if the effect refuses, fails, returns anything but arrays of numbers by name, or other ones when it
+    is called again.
     """
+    arrays = _drawn(effect, observation)
+    if not effect.is_built_in:
+        first, second = (
+            {name: array.tobytes() for name, array in drawn.items()} for drawn in (arrays, _drawn(effect, observation))
+        )
+        if first != second:
+            raise InputError(
+                f"effect {effect.label!r}: draw gives other arrays at every call, and no other run could repeat this "
+                "one; draw with the generator 'random' that it receives, and declare 'seed: int'"
+            )
+    return arrays
+
+
+def _drawn(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:
     random = np.random.default_rng(getattr(effect, "seed", 0))
     with guarded(effect):
         truth = effect.draw(observation, random)

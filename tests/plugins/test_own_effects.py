@@ -136,6 +136,12 @@ class Words(Effect):
     def apply(self, visibilities, observation, truth):
         return visibilities
 
+class Fresh(Effect):
+    def draw(self, observation, random):
+        return {"phase": np.random.default_rng().uniform(size=3)}
+    def apply(self, visibilities, observation, truth):
+        return visibilities
+
 class Drifting(GainEffect):
     def gains(self, observation, random):
         return np.ones((observation.n_antennas, observation.n_channels, observation.n_times + 1, 1), complex)
@@ -162,6 +168,7 @@ def test_an_effect_that_does_nothing_is_refused(tmp_path):
         ("Short", r"effect 'Short': apply returned an array of complex128 of shape \(1, 2, 32, 1\), expected"),
         ("Spoiling", "effect 'Spoiling': apply returned visibilities that are not finite"),
         ("Words", "effect 'Words': 'note' of its truth is an array of <U6"),
+        ("Fresh", "effect 'Fresh': draw gives other arrays at every call"),
         (
             "Drifting",
             r"effect 'Drifting': its gains are complex128 of shape \(7, 32, 3, 1\), expected complex of shape",
