@@ -11,7 +11,13 @@ from astropy.time import Time
 from pyuvdata import UVData
 
 from calstudy.base.constants import SECONDS_PER_DAY
-from calstudy.base.visibilities import positions, require_rectangular, use_bundled_earth_orientation
+from calstudy.base.visibilities import (
+    flag_cube,
+    positions,
+    require_rectangular,
+    to_cube,
+    use_bundled_earth_orientation,
+)
 
 
 def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
@@ -25,18 +31,41 @@ def fringe_stop_and_average(uvd: UVData, centre: float | None = None) -> UVData:
     require_rectangular(uvd)
     use_bundled_earth_orientation()
     date = (uvd.time_array.min() + uvd.time_array.max()) / 2 if centre is None else centre
-    averaged = uvd.copy()
-    averaged.phase_to_time(Time(date, format="jd", scale="utc"))
-    if averaged.Ntimes > 1:
+    phased = uvd.copy()
+    phased.phase_to_time(Time(date, format="jd", scale="utc"))
+    averaged = phased
+    if uvd.Ntimes > 1:
+        averaged = phased.copy(metadata_only=True)
         with warnings.catch_warnings():
             if centre is not None:
                 for message in ("There is a gap in the times", "The time difference between integrations"):
                     warnings.filterwarnings("ignore", message=message)
-            averaged.downsample_in_time(n_times_to_avg=averaged.Ntimes, allow_drift=False)
-    # pyuvdata sorts by baseline number; bring back the order of the input.
-    averaged.reorder_blts(order=positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))
+            averaged.downsample_in_time(n_times_to_avg=uvd.Ntimes, allow_drift=False)
+        # pyuvdata sorts by baseline number; bring back the order of the input.
+        averaged.reorder_blts(order=positions(averaged.baseline_array, uvd.baseline_array[: uvd.Nbls]))
+        averaged.data_array, averaged.flag_array, averaged.nsample_array = _averages(phased)
     averaged.data_array = averaged.data_array.astype(np.complex128, copy=False)
     return averaged
+
+
+def _averages(uvd: UVData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Average data, flags and nsamples over all integrations, (Nbls, Nfreqs, Npols), in their own precision.
+
+    pyuvdata, which goes through the baselines with masked arrays, has the same result in several times the time.
+    """
+    data, flags, (n_times, n_baselines) = to_cube(uvd), flag_cube(uvd), (uvd.Ntimes, uvd.Nbls)
+    nsamples = uvd.nsample_array.reshape(data.shape)
+    durations = uvd.integration_time.reshape(n_times, n_baselines)[:, :, None, None]
+    flagged: np.ndarray = np.logical_and.reduce(flags, axis=0)
+    total, weight = np.zeros(data.shape[1:], complex), np.zeros(data.shape[1:])
+    for time in range(n_times):
+        # A channel that is flagged throughout is averaged all the same.
+        used = nsamples[time] * durations[time] * (~flags[time] | flagged)
+        total += used * data[time]
+        weight += used
+    kept = weight / durations.sum(axis=0)
+    average = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
+    return average.astype(data.dtype), flagged, kept.astype(nsamples.dtype)
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,21 @@ def test_flags_and_nsamples_weigh(run, white):
     assert not np.allclose(np.abs(clean.data_array), np.abs(only_first), rtol=0.1)
 
 
+@pytest.mark.parametrize("precision", [np.complex64, np.complex128])
+def test_pyuvdata_has_the_same_average(run, white, precision):
+    uvd, rng = white(run, np.random.default_rng(7)), np.random.default_rng(8)
+    uvd.data_array = uvd.data_array.astype(precision)
+    uvd.flag_array[:] = rng.random(uvd.flag_array.shape) < 0.4
+    uvd.flag_array.reshape(12, run.Nbls, 8)[:, 2, 3] = True
+    uvd.nsample_array[:] = rng.uniform(0.5, 2, uvd.nsample_array.shape)
+    expected = uvd.copy()
+    expected.phase_to_time(Time((uvd.time_array.min() + uvd.time_array.max()) / 2, format="jd"))
+    expected.downsample_in_time(n_times_to_avg=12)
+    averaged = fringe_stop_and_average(uvd)
+    averaged.reorder_blts()
+    assert averaged == expected
+
+
 def test_baselines_keep_their_order(observe, white):
     template = observe(MwaLayout(kind="mwa-compact-hex-east", count=6), n_channels=8, n_times=3)
     averaged = fringe_stop_and_average(white(template, np.random.default_rng(5)))
