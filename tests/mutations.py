@@ -255,14 +255,14 @@ MUTATIONS = (
     ),
     Mutation(
         "an average without counts",
-        "averaged = uvd.copy()",
-        "averaged = uvd.copy(); averaged.nsample_array[:] = 1",
+        "used = nsamples[time] * durations[time] * (~flags[time] | flagged)",
+        "used = durations[time] * (~flags[time] | flagged)",
         AVERAGES,
     ),
     Mutation(
         "an average without flags",
-        "averaged = uvd.copy()",
-        "averaged = uvd.copy(); averaged.flag_array[:] = False",
+        "used = nsamples[time] * durations[time] * (~flags[time] | flagged)",
+        "used = nsamples[time] * durations[time]",
         AVERAGES,
     ),
     Mutation(
