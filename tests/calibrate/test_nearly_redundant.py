@@ -87,6 +87,7 @@ def test_one_model_per_baseline_does_not_care(window_rms, weights):
     assert window_rms(True, True, "calamity", weights) < 1.3
 
 
+@pytest.mark.chain
 def test_weights_of_own_gains_settle_where_few_baselines_are_redundant():
     """With antenna blocks of each channel as preconditioner throughout, they still change after ten passes."""
     channels = {"first": "167.075 MHz", "width": "375 kHz", "count": 64}

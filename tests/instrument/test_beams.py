@@ -239,6 +239,7 @@ def test_smooth_fit_follows_the_table_to_its_scatter(embedded):
     assert embedded.fit_error < 4e-4
 
 
+@pytest.mark.chain
 def test_smooth_fit_is_smooth_where_tabulated_steps_are_not(embedded):
     """Delay transform of the power beam: the fit has nothing at the 781 ns of the table's 1.28 MHz; others have."""
     taper = blackmanharris(len(CHANNELS), sym=False)
