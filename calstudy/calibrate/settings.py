@@ -262,8 +262,11 @@ class ForegroundPrior(Section):
         "`infinite`: foregrounds are free within the modelled delays; 0: none; `estimated`: the most likely one, from "
         "the data of each solve.",
     )
+    # Where few baselines are redundant and it is infinite, fits have another preconditioner since 2.
     shared_deviation: Deviation = Field(
-        0.0, description="The same for what redundant baselines have in common beside the mean."
+        0.0,
+        description="The same for what redundant baselines have in common beside the mean.",
+        json_schema_extra={REVISED: 2},
     )
     noise: FluxDensity | None = Field(
         None,

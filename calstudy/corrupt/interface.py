@@ -168,7 +168,7 @@ def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray
         )
         if first != second:
             raise InputError(
-                f"effect {effect.label!r}: draw gives other arrays at every call, and no other run could repeat this "
+                f"effect {effect.label!r}: what it draws is another at every call, and no other run could repeat this "
                 "one; draw with the generator 'random' that it receives, and declare 'seed: int'"
             )
     return arrays

@@ -61,7 +61,8 @@ def _averages(uvd: UVData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for time in range(n_times):
         # A channel that is flagged throughout is averaged all the same.
         used = nsamples[time] * durations[time] * (~flags[time] | flagged)
-        total += used * data[time]
+        # What is flagged may be NaN.
+        total += np.where(used > 0, used * data[time], 0)
         weight += used
     kept = weight / durations.sum(axis=0)
     average = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)

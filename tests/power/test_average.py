@@ -72,6 +72,8 @@ def test_pyuvdata_has_the_same_average(run, white, precision):
     uvd.flag_array[:] = rng.random(uvd.flag_array.shape) < 0.4
     uvd.flag_array.reshape(12, run.Nbls, 8)[:, 2, 3] = True
     uvd.nsample_array[:] = rng.uniform(0.5, 2, uvd.nsample_array.shape)
+    uvd.flag_array[[0, run.Nbls], 0, 0] = True, False
+    uvd.data_array[0, 0, 0] = np.nan
     expected = uvd.copy()
     expected.phase_to_time(Time((uvd.time_array.min() + uvd.time_array.max()) / 2, format="jd"))
     expected.downsample_in_time(n_times_to_avg=12)

@@ -47,7 +47,7 @@ CG_CHANNEL_ITERATIONS = 300
 CG_ANTENNA_ITERATIONS = 60
 # With coupled blocks, which take fewer than that to this tolerance.
 CG_COUPLED_TOLERANCE = 1e-8
-# Baselines without a model of their own, relative to all, up to which the channel blocks of each antenna are the better
+# Models fewer than baselines, relative to baselines, up to which the channel blocks of each antenna are the better
 # preconditioner. On the paper's minimally redundant array, 0.05, a fit with weights of its own gains takes a fourteenth
 # of the time with them. With 0.18 and more they predict a decrease of the loss that is too small by factors, and fits
 # stop ten times as far from the minimum.
