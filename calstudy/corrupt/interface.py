@@ -158,8 +158,8 @@ def require_usable(effects: Sequence[Effect], size: Size) -> None:
 def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray]:
     """Return the truth of an effect for an observation, checked; the same settings and observation give the same bits.
 
-    Raise InputError if the effect refuses, fails, returns anything but arrays of numbers by name, or other ones when it
-    is called again.
+    Raise InputError if the effect refuses, fails, or returns anything but arrays of numbers by name, the same ones at
+    every call.
     """
     arrays = _drawn(effect, observation)
     if not effect.is_built_in:
@@ -168,8 +168,8 @@ def draw_truth(effect: Effect, observation: Observation) -> dict[str, np.ndarray
         )
         if first != second:
             raise InputError(
-                f"effect {effect.label!r}: what it draws is another at every call, and no other run could repeat this "
-                "one; draw with the generator 'random' that it receives, and declare 'seed: int'"
+                f"effect {effect.label!r}: it draws different arrays at every call, so that no run can be repeated; "
+                "draw with the generator 'random' that it receives, and declare 'seed: int'"
             )
     return arrays
 

@@ -53,16 +53,16 @@ def _averages(uvd: UVData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     pyuvdata, which goes through the baselines with masked arrays, has the same result in several times the time.
     """
-    data, flags, (n_times, n_baselines) = to_cube(uvd), flag_cube(uvd), (uvd.Ntimes, uvd.Nbls)
+    data, flags = to_cube(uvd), flag_cube(uvd)
     nsamples = uvd.nsample_array.reshape(data.shape)
-    durations = uvd.integration_time.reshape(n_times, n_baselines)[:, :, None, None]
+    durations = uvd.integration_time.reshape(*data.shape[:2], 1, 1)
     flagged: np.ndarray = np.logical_and.reduce(flags, axis=0)
     total, weight = np.zeros(data.shape[1:], complex), np.zeros(data.shape[1:])
-    for time in range(n_times):
-        # A channel that is flagged throughout is averaged all the same.
+    for time in range(uvd.Ntimes):
+        # Samples that are flagged in all integrations are averaged as if they were not.
         used = nsamples[time] * durations[time] * (~flags[time] | flagged)
-        # What is flagged may be NaN.
-        total += np.where(used > 0, used * data[time], 0)
+        # Flagged samples may be NaN.
+        total += used * np.where(used > 0, data[time], 0)
         weight += used
     kept = weight / durations.sum(axis=0)
     average = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)

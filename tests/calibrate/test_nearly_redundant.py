@@ -103,4 +103,4 @@ def test_weights_of_own_gains_settle_where_few_baselines_are_redundant():
     calibrator = CALIBRATORS.make({"calibrator": "calamity-redundant", "weights": "gains"})
     (solve,) = run_calibrator(calibrator, data, sky).solutions
     assert solve.status == "converged"
-    assert solve.diagnostics["passes"] <= 5
+    assert solve.diagnostics["weight_change"] < calibrator.weights.tolerance

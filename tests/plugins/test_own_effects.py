@@ -168,7 +168,7 @@ def test_an_effect_that_does_nothing_is_refused(tmp_path):
         ("Short", r"effect 'Short': apply returned an array of complex128 of shape \(1, 2, 32, 1\), expected"),
         ("Spoiling", "effect 'Spoiling': apply returned visibilities that are not finite"),
         ("Words", "effect 'Words': 'note' of its truth is an array of <U6"),
-        ("Fresh", "effect 'Fresh': what it draws is another at every call"),
+        ("Fresh", "effect 'Fresh': it draws different arrays at every call"),
         (
             "Drifting",
             r"effect 'Drifting': its gains are complex128 of shape \(7, 32, 3, 1\), expected complex of shape",
