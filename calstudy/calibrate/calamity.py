@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,14 +125,18 @@ def _solve_all(
 
 
 def _solve(
-    problem: CalibrationProblem, solver: Solver, warm: WarmStart | None, anew: bool
+    problem: CalibrationProblem,
+    solver: Solver,
+    warm: WarmStart | None,
+    anew: bool,
+    repeated: Callable[[np.ndarray], bool] | None = None,
 ) -> tuple[Solution, WarmStart | None, bool]:
     """Solve from the warm start and, if that got stuck, from the problem's own gains; the lower loss counts.
 
     `anew` allows the second solve after a stall. It is returned, false once the second solve has stalled too, because
-    that will happen again for the next integration.
+    that will happen again for the next integration. For `repeated` see `solve_warm`.
     """
-    solution, next_warm = solve_warm(problem, solver, warm)
+    solution, next_warm = solve_warm(problem, solver, warm, repeated)
     first = solution.record
     stuck = first.status == "failed" or (first.status == "stalled" and anew)
     if warm is None or not stuck:
@@ -185,9 +190,11 @@ class _Passes:
         start, change, anew, failed = warm, 0.0, True, False
         exact, searched = self._search is self._solver, False
         while len(done) < self._most:
-            exact = exact or len(done) == self._most - 1
+            last = len(done) == self._most - 1
+            exact = exact or last
             solver = self._search if not exact else self._solver if len(done) < QUICK_PASSES else self._late
-            solution, warm, anew = _solve(current, solver, warm, anew)
+            repeated = None if last else partial(self._repeated, problem, current.weights if exact else None)
+            solution, warm, anew = _solve(current, solver, warm, anew, repeated)
             if failed := bool(done) and not solution.record.usable:
                 break
             done.append(_Pass(solution, warm, current.fractions if self._estimated else None))
@@ -211,6 +218,16 @@ class _Passes:
             # The record of what is kept instead has its own deviations.
             return self._kept(done, change, None if instead else found, "" if instead else NO_EQUAL_SOLVE, instead)
         return self._kept(done, change, found, NO_EXACT_SOLVE if failed and searched else "")
+
+    def _repeated(self, problem: CalibrationProblem, weights: np.ndarray | None, gains: np.ndarray) -> bool:
+        """Whether another pass follows one that has found these gains, before deviations are estimated.
+
+        `weights` are those of the pass, (Nbls, Nfreqs), or None while deviations are searched for.
+        """
+        if weights is None or self._weights is None:
+            return weights is None
+        # These gains still have their degeneracies, and weights differ by rounding from those that end the passes.
+        return weight_change(problem.weighted_by(gains).weights, weights) > 1.001 * self._weights.tolerance
 
     def _with_equal_weights(
         self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None

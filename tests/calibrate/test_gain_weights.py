@@ -303,7 +303,7 @@ def test_where_weights_run_away_and_a_pass_fails(monkeypatch, fails, kept, statu
     equal = problem.weighted_by(np.ones_like(toy.gains)).weights
     calls = []
 
-    def stub(current, solver, warm, anew):
+    def stub(current, solver, warm, anew, repeated):
         is_equal = np.array_equal(current.weights, equal)
         calls.append("equal" if is_equal else "pass")
         failing = (fails == "equal") if is_equal else (fails == "second" and calls.count("pass") == 2)

@@ -14,9 +14,10 @@ from toy_structures import in_the_span, product_error, redundant_structure
 
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate import calamity
+from calstudy.calibrate.calibrators.least_squares import Calamity
 from calstudy.calibrate.degeneracy import fix_degeneracies, fix_phase, model_scale, sky_model_slope
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure, flag_weights, gain_products
-from calstudy.calibrate.settings import BasisSettings
+from calstudy.calibrate.settings import BasisSettings, GainWeights, GaussNewtonSettings
 from calstudy.calibrate.solvers import reduced
 from calstudy.calibrate.solvers.adamax import Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
@@ -380,6 +381,31 @@ def test_single_precision_says_where_it_does_not_reach(noise):
 
 
 @pytest.mark.chain
+def test_a_solve_from_which_another_starts_is_not_checked():
+    """The check says what a fit cannot reach. It does not change where the iteration ends."""
+    simulation, structure = golomb(noise=1e-6)
+    problem = simulation.problem(0, structure)
+    checked, last, repeated = (
+        solve_warm(problem, GaussNewton(), None, asked)[0] for asked in (None, lambda gains: False, lambda gains: True)
+    )
+    assert checked.record.status == last.record.status == "stalled"
+    assert repeated.record.status == "converged"
+    for other in (last, repeated):
+        np.testing.assert_allclose(other.gains, checked.gains, rtol=1e-6)
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("passes", [2, 10])
+def test_the_last_pass_of_weights_is_checked(passes):
+    """Passes with weights of own gains end with the status of a fit with these weights, settled or not."""
+    simulation, structure = golomb(noise=1e-6)
+    settings = Calamity(weights=GainWeights(passes=passes), solver=GaussNewtonSettings())
+    found = calamity._Passes(settings, GaussNewton(), (0, 0)).solve(simulation.problem(0, structure), None, None)
+    assert found.solution.record.diagnostics["passes"] > 1
+    assert found.solution.record.status == "stalled", found.solution.record.message
+
+
+@pytest.mark.chain
 def test_warm_starts_say_what_cold_ones_say():
     """One step from the solution before is enough for the loss, but not for the directions that damping hides."""
     simulation, structure = golomb(noise=1e-5, eor=1e-4)
@@ -396,9 +422,9 @@ def test_integrations_that_all_stall_are_not_all_solved_twice(monkeypatch):
     simulation, structure = golomb(noise=1e-5, eor=1e-4)
     starts = []
 
-    def counted(problem, solver, warm=None):
+    def counted(problem, solver, warm=None, repeated=None):
         starts.append(warm)
-        return solve_warm(problem, solver, warm)
+        return solve_warm(problem, solver, warm, repeated)
 
     monkeypatch.setattr(calamity, "solve_warm", counted)
     warm, anew = None, True

@@ -319,6 +319,11 @@ class Adamax:
     stop: Stop = "best-loss"
     keep: Literal["best", "last"] = "best"
 
+    @property
+    def unchecked(self) -> Adamax:
+        """The same: the iteration has no check of convergence of its own."""
+        return self
+
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> AdamaxState:
         """Start from the first gains and their best-fitting foregrounds, in weighted least squares."""
         kernels = compiled(problem.structure, self.precision, problem.prior)

@@ -180,12 +180,19 @@ class GaussNewton:
     patience
         Number of steps after which a fit with a finite prior counts as slow; with zero it is in double precision
         wherever single precision does not resolve the damping.
+    check : check convergence with less damping where the damping may hide directions that matter
     """
 
     tolerance: float = 1e-3
     max_steps: int = 100
     precision: Literal["single", "double"] = "single"
     patience: int = 20
+    check: bool = True
+
+    @property
+    def unchecked(self) -> GaussNewton:
+        """The same iteration without the check of convergence, which in double precision is a part of the iteration."""
+        return self if self.precision == "double" else replace(self, check=False)
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and reuse the preconditioner of the warm start."""
@@ -214,7 +221,7 @@ class GaussNewton:
             state = self._prepared(_in_double(state, thorough=False))
         if self._goes_on(state) and (settled or (state.gained < state.history[-1] and not state.curved)):
             return self._checked(state)
-        if settled and state.needs_check:
+        if settled and self._due(state):
             return replace(state, predicted=self._checked(state).predicted, checked=True)
         kernels = state.kernels
         state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
@@ -253,7 +260,7 @@ class GaussNewton:
         if loss < self._rounding:
             return Solve("converged", f"the residual is rounding: its loss relative to the data is {loss:.1e}")
         fall = state.predicted / loss
-        if self._settled(state) and (state.checked or not (state.needs_check or state.curved)):
+        if self._settled(state) and (state.checked or not (self._due(state) or state.curved)):
             return Solve("converged", f"the next step would lower the loss by {fall:.1e} of itself")
         if state.checked and self.precision == "single":
             return Solve(
@@ -283,6 +290,10 @@ class GaussNewton:
             return state.predicted / loss < most
         falling = min(state.decrease_to_come, state.gained / loss)
         return state.predicted / loss < self.tolerance and falling < self.tolerance
+
+    def _due(self, state: GaussNewtonState) -> bool:
+        """Whether convergence at this state is to be checked."""
+        return self.check and state.needs_check
 
     def _goes_on(self, state: GaussNewtonState) -> bool:
         """Whether the iteration is in double precision, or must continue there."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
@@ -54,6 +54,10 @@ class Solver(Protocol):
     def tolerance(self) -> float:
         """Return the solver's threshold of convergence, by a measure of its own."""
 
+    @property
+    def unchecked(self) -> Solver:
+        """Return the same iteration without a separate check of convergence at its end, or itself if it has none."""
+
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> Any:
         """Return the first state, at the warm start's gains if there is one and at the problem's otherwise."""
 
@@ -77,17 +81,26 @@ class Solver(Protocol):
 
 
 def solve_warm(
-    problem: CalibrationProblem, solver: Solver, warm: WarmStart | None = None
+    problem: CalibrationProblem,
+    solver: Solver,
+    warm: WarmStart | None = None,
+    repeated: Callable[[np.ndarray], bool] | None = None,
 ) -> tuple[Solution, WarmStart | None]:
     """Solve one problem from a warm start, and return the solution with the warm start for the next.
 
     The solution has its degeneracies fixed (see `calstudy.calibrate.degeneracy`). A lack of convergence is a status,
     not an error; after a failed solve there is no warm start. By default the solve starts from the initial gains.
+    `repeated` says of the gains at the end of the iteration, (Nants, Nfreqs), whether another solve starts from them;
+    then their convergence is not checked separately.
     """
     started, cpu_started = time.perf_counter(), time.process_time()
     state = solver.init(problem, warm)
-    while (ended := solver.terminate(state)) is None:
-        state = solver.step(state)
+    if repeated is None:
+        state, ended = _iterated(solver, state)
+    else:
+        state, ended = _iterated(solver.unchecked, state)
+        if not repeated(solver.estimate(state)[0]):
+            state, ended = _iterated(solver, state)
     losses = np.array(solver.losses(state), float)
     gains, model = solver.estimate(state)
     newton_decrement = rms = math.nan
@@ -114,6 +127,12 @@ def solve_warm(
     )
     logger.debug("%s after %d steps, %.2f s: %s", record.status, record.steps, record.seconds, record.message)
     return Solution(gains, model, record), WarmStart(gains, solver.memory(state)) if record.usable else None
+
+
+def _iterated(solver: Solver, state: Any) -> tuple[Any, Solve]:
+    while (ended := solver.terminate(state)) is None:
+        state = solver.step(state)
+    return state, ended
 
 
 def _hidden(gains: np.ndarray, model: np.ndarray, problem: CalibrationProblem) -> str | None:
