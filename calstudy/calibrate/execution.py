@@ -240,6 +240,7 @@ class _Returned:
         self, calibrator: Calibrator, returned: Calibration, observation: Observation, assumed: Assumed
     ) -> None:
         self.calibrator, self.returned = calibrator, returned
+        self.sky_model = None if assumed.sky_model is None else assumed.sky_model.uvd
         self._require(isinstance(returned, Calibration), f"returns {type(returned).__name__}, not a Calibration")
         self.groups = calibrator.solves(observation.n_times)
         self.fitted = observation
@@ -377,12 +378,18 @@ class _Returned:
         residual = self._residual(gains, flags)
         template = self.fitted.uvd
         model = self.model if self.closure is None else self.closure * self.model
-        return CalibrationResult(
+        result = CalibrationResult(
             make_gains(template, self.numbers, gains, self.gain_flags),
             make_visibilities(template, model, flags),
             make_visibilities(template, residual, flags),
             tuple(self._records(usage)),
         )
+        sky = self.sky_model
+        if sky is not None and str(sky.vis_units).lower() == "jy" and self.calibrator.on_sky_scale:
+            result.gains.gain_scale, result.gains.pol_convention = sky.vis_units, sky.pol_convention
+            for uvd in (result.model, result.residual):
+                uvd.vis_units, uvd.pol_convention = sky.vis_units, sky.pol_convention
+        return result
 
     def _residual(self, gains: np.ndarray, flags: np.ndarray) -> np.ndarray:
         """Compute V / (c_ab g_a g_b*) - F, zero where flagged, and add the flags of the gains to `flags`."""

@@ -208,6 +208,11 @@ class Calibrator(Plugin):
         """Whether the data must have autocorrelations."""
         return False
 
+    @property
+    def on_sky_scale(self) -> bool:
+        """Whether calibrated data have the unit of the sky model, where there is one, and not that of the data."""
+        return True
+
     def cost(self, size: Size) -> Cost:
         """Return the cost of calibrating data of this size; by default little beyond the data themselves."""
         return Cost(5.0 + 1e-6 * size.samples, LIBRARIES_MEMORY + 6 * COMPLEX128 * size.samples)

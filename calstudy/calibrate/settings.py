@@ -409,6 +409,11 @@ class ForegroundFit(GainFit):
     basis: BasisSettings = BasisSettings()
     prior: ScalePrior = "sum"
 
+    @property
+    def on_sky_scale(self) -> bool:
+        """Whether the sky model fixes the overall scale."""
+        return self.prior not in ("gains", "none")
+
     @model_validator(mode="before")
     @classmethod
     def _complete_prior(cls, data: Any) -> Any:

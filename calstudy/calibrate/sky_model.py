@@ -57,8 +57,9 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
     """Match a prepared sky model and prepared data in their baselines, and describe each change in one sentence.
 
     Cross-correlations that the sky model lacks are left out of the data. Autocorrelations that it lacks stay, with a
-    sky model of zero, unless they are fitted (`autos`): weights may need them. The inputs are from
-    `calstudy.realdata.reading.prepare`, and not changed; the returned sky model has the samples of the returned data,
+    sky model of zero, unless they are fitted (`autos`): weights may need them. Samples that are flagged in the sky
+    model are flagged in the returned data. The inputs are from `calstudy.realdata.reading.prepare`, and not changed;
+    the returned sky model has the samples of the returned data,
     in their order. Raises InputError if no cross-correlation is in both, all are zero or flagged in the
     sky model, or as `match_sky_model`.
     """
@@ -78,6 +79,14 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
     part = match_sky_model(sky, data if whole else data.select(blt_inds=np.flatnonzero(modelled), inplace=False))
     if not (~part.flag_array & (part.data_array != 0))[part.ant_1_array != part.ant_2_array].any():
         raise InputError("sky model: where the data are, all of it is zero or flagged; it must be visibilities")
+    unknown = part.flag_array & ~data.flag_array[modelled]
+    if not autos:
+        unknown[part.ant_1_array == part.ant_2_array] = False
+    if unknown.any():
+        data = data.copy()
+        data.flag_array[modelled] |= unknown
+        notes.append(f"{unknown.sum()} samples that are flagged in the sky model, or missing there, were flagged.")
+    part.data_array[part.flag_array] = 0
     if whole:
         return part, data, notes
     filled = from_cube(data, np.zeros((data.Ntimes, data.Nbls, data.Nfreqs, data.Npols), complex))

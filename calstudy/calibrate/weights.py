@@ -112,8 +112,10 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
         raise InputError(f"{where}: weights must be real, these are complex")
     if not np.isfinite(values).all() or (values < 0).any():
         raise InputError(f"{where}: weights must be finite and not negative")
-    if file.Nfreqs != data.n_channels or not np.allclose(file.freq_array, data.frequencies, rtol=1e-9, atol=0):
-        raise InputError(f"{where}: the channels of the weights are not those of the data")
+    of_file = np.ravel(file.freq_array)
+    channels = np.abs(of_file[:, None] - data.frequencies).argmin(axis=0)
+    if not np.allclose(of_file[channels], data.frequencies, rtol=1e-9, atol=0):
+        raise InputError(f"{where}: no weights for some channels of the data")
     rows = {key: row for row, key in enumerate(_keys(file))}
     wanted, flagged = _keys(data.uvd), data.flags.all(axis=(2, 3)).ravel()
     if any(key not in rows for key, without in zip(wanted, flagged, strict=True) if not without):
@@ -122,14 +124,15 @@ def _from_file(data: Observation, settings: FileWeights) -> np.ndarray:
     if any(hand.size != 1 for hand in hands):
         raise InputError(f"{where}: no weights for some polarizations of the data")
     # The weights of flagged samples are not used.
-    found = values[[rows.get(key, 0) for key in wanted]][:, :, np.concatenate(hands)]
+    found = values[[rows.get(key, 0) for key in wanted]][:, channels][:, :, np.concatenate(hands)]
     return found.astype(float).reshape(data.shape)
 
 
-def _keys(file: UVData | UVFlag) -> list[tuple[int, int]]:
-    """Return baseline and time, in units of the tolerance, of each row of a file."""
+def _keys(file: UVData | UVFlag) -> list[tuple[int, int, int]]:
+    """Return both antennas, the smaller number first, and time, in units of the tolerance, of each row of a file."""
     times = np.round(file.time_array / TIME_TOLERANCE).astype(int)
-    return list(zip(file.baseline_array.tolist(), times.tolist(), strict=True))
+    pairs = np.sort(np.column_stack([file.ant_1_array, file.ant_2_array]), axis=1)
+    return [(a, b, time) for (a, b), time in zip(pairs.tolist(), times.tolist(), strict=True)]
 
 
 def _read_uvflag(path: Path, where: str) -> UVFlag:

@@ -18,7 +18,7 @@ from calstudy.calibrate.records import SETTLED, USABLE, CalibrationResult, Solve
 from calstudy.calibrate.sky_model import common_baselines
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, sky_model
-from calstudy.products.corruption import LEVELS
+from calstudy.products.corruption import read_noise
 from calstudy.products.files import (
     DATA,
     GAINS,
@@ -139,7 +139,7 @@ class Calibrated(Task):
             data = with_autocorrelations(data, read_visibilities(self.autocorrelations / DATA, times))
             if sky is not None:
                 sky, data, _ = common_baselines(sky, data, autos=False)
-        return data, sky, None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]
+        return data, sky, None if self.levels is None else read_noise(self.levels)
 
 
 class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):

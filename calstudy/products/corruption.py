@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
@@ -359,6 +360,13 @@ class MeasureNoise(Task, stage="noise-level", version=1):
     def _cost(self) -> Cost:
         samples = size_of(self).samples
         return Cost(0.2 + 5e-8 * samples, LIBRARIES_MEMORY + 5 * samples * COMPLEX64, 1e5)
+
+
+def read_noise(folder: Path) -> float:
+    """Read sigma of the noise of a sample, as calibrators are given it; raises InputError if it is not known."""
+    if not (folder / LEVELS).exists():
+        raise InputError("calibration.foreground_prior.noise: must be given, for no unflagged autocorrelations tell it")
+    return float(read_json(folder / LEVELS)["noise_std"])
 
 
 class Autocorrelate(Task, stage="autocorrelations", version=1):

@@ -18,7 +18,7 @@ from calstudy.calibrate.settings import GainFit
 from calstudy.calibrate.sky_model import common_baselines
 from calstudy.corrupt.noise import effective_area
 from calstudy.products.calibration import calibration_of
-from calstudy.products.corruption import LEVELS
+from calstudy.products.corruption import LEVELS, read_noise
 from calstudy.products.files import (
     AVERAGE,
     DATA,
@@ -26,14 +26,21 @@ from calstudy.products.files import (
     MODEL,
     RESIDUAL,
     VISIBILITIES,
-    read_json,
     read_visibilities,
     write_json,
     write_visibilities,
 )
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
 from calstudy.products.spectra import InBlocks, blocks_in, cross_power
-from calstudy.realdata.halves import PARITIES, WHOLE, east_and_north, flag_channels, half_of_sums, interleaved
+from calstudy.realdata.halves import (
+    PARITIES,
+    WHOLE,
+    east_and_north,
+    flag_channels,
+    half_of_sums,
+    interleaved,
+    share_convention,
+)
 from calstudy.realdata.interference import flag_interference
 from calstudy.realdata.selection import Selection
 from calstudy.realdata.settings import Factor, FromAutocorrelations, ObservedSettings, Select
@@ -73,6 +80,7 @@ def observed(graph: MeasuredGraph, part: str) -> Observe:
         flag=list(section.flag) or None,
         interference=section.flag_interference,
         positions=section.positions,
+        pol_convention=section.pol_convention if halves else None,
         sky_model=section.sky_model,
         autos=None if section.sky_model is None else autos,
         flux_scale=flux_scale,
@@ -124,12 +132,14 @@ def noise_power(graph: MeasuredGraph, what: str, source: str) -> Task:
     return cross_power(graph, noise.label, [noise, noise], own)
 
 
-class Observe(Task, stage="observe", version=6):
+class Observe(Task, stage="observe", version=7):
     """The data of one part, and the sky model.
 
     The noise is that of a sample with nsamples of one since version 2, and has the mean of inverse variances since 3.
     Samples of no measurement are flagged since 4. Windows are in the order of their frequencies since 5, and data with
-    renamed feeds have a keyword that says so.
+    renamed feeds have a keyword that says so. Since 7, samples that are flagged in the sky model are flagged, halves
+    have the convention I = XX + YY, a file without counts of measurements has counts of one, and samples are copied
+    only where averaging differs between baselines.
     """
 
     files: Sequence[Path]
@@ -141,6 +151,7 @@ class Observe(Task, stage="observe", version=6):
     flag: Sequence[str] | None = None
     interference: Any = None
     positions: Path | None = None
+    pol_convention: str | None = None
     sky_model: Path | None = None
     autos: bool | None = None
     flux_scale: Factor | FromAutocorrelations | None = None
@@ -155,7 +166,8 @@ class Observe(Task, stage="observe", version=6):
         data.data_array = data.data_array.astype(complex) * factor
         for name, uvd in ((DATA, data), (VISIBILITIES, sky)):
             if uvd is not None:
-                uvd.vis_units = uvd.vis_units if self.as_given else "Jy"
+                if not self.as_given:
+                    uvd.vis_units, uvd.pol_convention = "Jy", "sum"
                 write_visibilities(uvd, output / name)
         noise = sample_noise(data)
         if noise is not None:
@@ -183,12 +195,14 @@ class Observe(Task, stage="observe", version=6):
             placed = [place_antennas(data, self.positions)]
         data, changed = self._prepared(data, selection, self.flag or ())
         notes = placed + changed
+        if self.difference is not None:
+            data.integration_time = data.integration_time / 2
         if self.interference is not None:
             notes.append(flag_interference(data, self.interference))
         if self.sky_model is not None:
-            alone = Selection(polarizations=selection.polarizations)
             x = x_in_file(data) or "east"
-            sky, sky_notes = self._prepared(read_visibilities([self.sky_model]), alone, x=x)
+            # Its polarizations are those of the data by direction, whatever the file calls them.
+            sky, sky_notes = self._prepared(read_visibilities([self.sky_model]), Selection(), x=x)
             if str(sky.vis_units).lower() not in ("jy", "uncalib"):
                 raise InputError(f"sky model: is in {sky.vis_units!r}, and must be in Jy; convert it first")
             sky, data, left_out = common_baselines(sky, data, bool(self.autos))
@@ -211,7 +225,7 @@ class Observe(Task, stage="observe", version=6):
         except InputError as error:
             raise InputError(str(error).replace("--select ", "observed.select.")) from None
         if not self.as_given:
-            notes += east_and_north(data)
+            notes += east_and_north(data) + share_convention(data, self.pol_convention)
         for text in flag:
             flag_channels(data, text)
         return data, notes
@@ -250,8 +264,7 @@ class Observe(Task, stage="observe", version=6):
 def read_observed(folder: Path, calibrator: Calibrator, sky_model: bool) -> tuple[UVData, UVData | None, float | None]:
     """Read the data of a product of stage `observe`, with the sky model and the noise level that a calibrator needs."""
     sky = read_visibilities(folder / VISIBILITIES) if sky_model else None
-    noise = read_json(folder / LEVELS)["noise_std"] if calibrator.needs_noise else None
-    return read_visibilities(folder / DATA), sky, noise
+    return read_visibilities(folder / DATA), sky, read_noise(folder) if calibrator.needs_noise else None
 
 
 class ObservedAverage(InBlocks, stage="observed-average", version=2):

@@ -39,8 +39,10 @@ class Facts:
 
     `frame` has antennas, baselines (autocorrelations among them) and channels, ascending. `times` (Julian dates) and
     `sidereal_times` (rad) are (Ntimes,); `integration` is the duration of the shortest one, s. `autos` is true if there
-    are autocorrelations of all antennas. `polarizations` are those of parallel hands, as pyuvdata numbers them; where
-    power spectra are made x is the eastern feed, whatever the file calls it.
+    are autocorrelations of all antennas. `copied` is true if averaging in time differs between baselines, so that long
+    samples are copied to the times of short ones. `pol_convention` is that of pyuvdata, None if the files do not tell
+    it. `polarizations` are those of parallel hands, as pyuvdata numbers
+    them; where power spectra are made x is the eastern feed, whatever the file calls it.
     """
 
     unit: str
@@ -50,6 +52,8 @@ class Facts:
     integration: float
     autos: bool
     polarizations: tuple[int, ...]
+    copied: bool = False
+    pol_convention: str | None = None
 
     @property
     def duration(self) -> float:
@@ -149,7 +153,7 @@ def read_facts(
         place_antennas(data, positions)
     data = select(data, replace(selection, times=None))
     share_orientation(data)
-    share_times(data, [])
+    copied = share_times(data, [])
     # Baselines without samples at the selected times are filled with flagged ones.
     pairs = np.unique(np.column_stack([data.ant_1_array, data.ant_2_array]), axis=0)
     crosses, autos = pairs[pairs[:, 0] != pairs[:, 1]], pairs[pairs[:, 0] == pairs[:, 1], 0]
@@ -183,6 +187,8 @@ def read_facts(
         integration=float(np.min(data.integration_time)),
         autos=set(np.unique(crosses).tolist()) <= set(autos.tolist()),
         polarizations=tuple(parallel),
+        copied=copied,
+        pol_convention=data.pol_convention,
     )
 
 
@@ -202,6 +208,13 @@ def modelled(frame: Frame, path: Path) -> Frame:
             "number)"
         )
     return frame.baselines(chosen | frame.autos)
+
+
+def pol_convention_of(path: Path) -> str | None:
+    """Return what pyuvdata calls the `pol_convention` of a file, or None if the file does not tell it."""
+    from calstudy.realdata.reading import read_metadata
+
+    return read_metadata((path,)).pol_convention
 
 
 def _require_even(frequencies: np.ndarray) -> None:
@@ -290,7 +303,8 @@ def interleaved(data: UVData, parity: str) -> UVData:
 def half_of_sums(sums: UVData, differences: UVData, parity: str) -> None:
     """Turn sums of a correlator's two samples into one of these, (sum + difference) / 2 or (sum - difference) / 2.
 
-    Raise InputError if both are not of the same samples in the same order. Samples flagged in either are flagged.
+    Raise InputError if both are not of the same samples in the same order. Samples flagged in either are flagged. The
+    durations stay those of the sums.
     """
     same = (np.array_equal(getattr(sums, x), getattr(differences, x)) for x in ("baseline_array", "time_array"))
     if sums.data_array.shape != differences.data_array.shape or not all(same):
@@ -298,7 +312,6 @@ def half_of_sums(sums: UVData, differences: UVData, parity: str) -> None:
     sign = 1 if parity == PARITIES[0] else -1
     sums.data_array = (sums.data_array + sign * differences.data_array) / 2
     sums.flag_array = sums.flag_array | differences.flag_array
-    sums.integration_time = sums.integration_time / 2
 
 
 def flag_channels(data: UVData, text: str) -> None:
@@ -312,6 +325,22 @@ def flag_channels(data: UVData, text: str) -> None:
             f"{frequencies.max() / 1e6:.3f} MHz"
         )
     data.flag_array[:, chosen] = True
+
+
+def share_convention(data: UVData, convention: str | None) -> list[str]:
+    """Bring visibilities to I = XX + YY, the convention "sum" of pyuvdata; return sentences on the changes.
+
+    `convention` is that of files that do not tell it; None: "sum".
+    """
+    has_unit, told = str(data.vis_units).lower() == "jy", data.pol_convention
+    if has_unit:
+        data.pol_convention = "sum"
+    if (told or convention) == "avg":
+        data.data_array = data.data_array / 2
+        return ["Visibilities with I = (XX + YY) / 2 were divided by 2."]
+    if has_unit and told is None and convention is None:
+        return ["The file does not tell whether I is XX + YY or half of that (pol_convention); XX + YY is taken."]
+    return []
 
 
 def east_and_north(data: UVData) -> list[str]:

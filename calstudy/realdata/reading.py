@@ -32,6 +32,8 @@ logger = logging.getLogger(__name__)
 
 # With a smaller fraction of its samples present, a data set has too few baselines at common times.
 MIN_PRESENT = 0.5
+# Baselines whose samples are so many times as far apart as those of others have been averaged more than these.
+COPIED = 1.5
 # Range of radio telescopes, Hz; other values have another unit, or the file is damaged.
 LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e6, 1e12
 EVERYTHING = Selection()
@@ -139,6 +141,9 @@ def prepare(data: UVData, selection: Selection = EVERYTHING, x: str = "east") ->
         data.unproject_phase()
         notes.append("The data were phased to a source; they are calibrated, and written, as a drift scan.")
     share_orientation(data)
+    if not data.nsample_array.any():
+        data.nsample_array[:] = 1
+        notes.append("The file does not count measurements (all nsamples are 0); each sample counts as one.")
     share_times(data, notes)
     data.reorder_freqs(channel_order="freq", spw_order="freq", run_check=False)
     _require_ascending(np.ravel(data.freq_array))
@@ -152,8 +157,7 @@ def prepare(data: UVData, selection: Selection = EVERYTHING, x: str = "east") ->
     autos = data.ant_1_array == data.ant_2_array
     data.data_array[autos[:, None, None] & ~np.isfinite(data.data_array)] = 0
     none = (data.nsample_array == 0) & ~data.flag_array
-    # Programs that do not count samples leave all numbers at zero.
-    if none.any() and data.nsample_array.any():
+    if none.any():
         data.flag_array |= none
         notes.append(f"{none.sum()} samples are of no measurement (nsamples of 0) and were flagged.")
     for note in notes:
@@ -216,16 +220,31 @@ def share_orientation(data: UVData) -> None:
         data.conjugate_bls(np.flatnonzero(turned & np.isin(baseline, mixed)))
 
 
-def share_times(data: UVData, notes: list[str]) -> None:
-    """Undo averaging in time that differs between baselines, of data or of metadata alone."""
-    integration = np.asarray(data.integration_time)
-    shortest = float(integration.min())
+def share_times(data: UVData, notes: list[str]) -> bool:
+    """Give all samples one duration, in data or in metadata alone, and return whether samples were copied for that.
+
+    Averaging in time that differs between baselines is undone by copies. Other durations, as of a last integration or
+    where samples were flagged before averaging, become numbers of measurements.
+    """
+    integration = np.asarray(data.integration_time, float)
+    shortest, longest = float(integration.min()), float(integration.max())
     if np.allclose(integration, shortest, rtol=0.01):
-        return
+        return False
+    cadences = _cadences(data)
+    if cadences.max() < COPIED * cadences.min():
+        usual = float(np.median(integration))
+        if data.nsample_array is not None:
+            data.nsample_array = data.nsample_array * (integration / usual)[:, None, None]
+        data.integration_time = np.full(integration.size, usual)
+        notes.append(
+            f"Samples last {shortest:.3g} to {longest:.3g} s; they count as {usual:.3g} s, with nsamples in proportion."
+        )
+        return False
     with redirect_stdout(StringIO()):
         data.upsample_in_time(shortest * 1.001, blt_order="time", minor_order="baseline")
     notes.append(
-        f"Baselines were averaged over {shortest:.3g} to {integration.max():.3g} s; all are copied to the shortest."
+        f"Baselines were averaged over {shortest:.3g} to {longest:.3g} s; all are copied to the shortest, and chi "
+        "squared of copies is too low by their number."
     )
     middle = np.asarray(data.time_array)
     tolerance = 0.4 * shortest / SECONDS_PER_DAY
@@ -234,6 +253,21 @@ def share_times(data: UVData, notes: list[str]) -> None:
     data.time_array = times[starts][np.cumsum(starts)[np.searchsorted(times, middle)] - 1]
     data.set_lsts_from_time_array()
     data.Ntimes = np.unique(data.time_array).size
+    return True
+
+
+def _cadences(data: UVData) -> np.ndarray:
+    """Return the median distance in time of the samples of each baseline, or the duration of a single one, in s."""
+    baselines, times = np.asarray(data.baseline_array), np.asarray(data.time_array)
+    order = np.lexsort((times, baselines))
+    starts = np.flatnonzero(np.diff(baselines[order])) + 1
+    rows = np.split(order, starts)
+    return np.array(
+        [
+            np.median(np.diff(times[row])) * SECONDS_PER_DAY if row.size > 1 else data.integration_time[row[0]]
+            for row in rows
+        ]
+    )
 
 
 def _filled(data: UVData, notes: list[str]) -> UVData:

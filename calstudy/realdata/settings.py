@@ -212,6 +212,11 @@ class ObservedSettings(DataSettings):
         description="How data become Jy that are in another unit; null: they are in Jy, or become so by the gains, "
         "where there is a sky model.",
     )
+    pol_convention: Literal["sum", "avg"] | None = Field(
+        None,
+        description="Convention of files in Jy that do not tell it: I = XX + YY (sum, as pyuvsim has it), or half of "
+        "that (avg, as CASA, LOFAR and the MWA have it). A mistake makes a factor of four in power. null: sum.",
+    )
 
     @model_validator(mode="after")
     def _sky_model_is_of_one_data_set(self) -> ObservedSettings:

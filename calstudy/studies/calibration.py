@@ -18,6 +18,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 from rich.console import Console
 
 from calstudy import __version__
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains, write_gains
 from calstudy.base.gains import closest_solutions, gain_products, solutions
@@ -64,6 +65,8 @@ if TYPE_CHECKING:
 FIGURE, UNFINISHED, IN_USE = "diagnostics", ".unfinished", ".calibrating"
 GainFormat = Literal["calfits", "h5parm", "hyperdrive", "mwaocal"]
 SUFFIXES = {"calfits": ".calfits", "h5parm": ".h5", "hyperdrive": ".fits", "mwaocal": ".bin"}
+CALFITS_TOLERANCE = 1e-3
+"""Distances of times (s) and of channels (Hz) that differ by more are not equal, as pyuvdata has it."""
 LINEAR = {-5, -6}
 """Polarizations xx and yy, as pyuvdata numbers them."""
 FIGURE_FILES = tuple(f"{FIGURE}.{ending}" for ending in ("npz", "pdf", "png"))
@@ -209,6 +212,13 @@ class DataCalibration(DataStudy):
                 "also: hyperdrive and mwaocal hold gains of xx and yy, which the data do not both have; take calfits "
                 "or h5parm"
             )
+        if "calfits" in content.also:
+            for what, values in (("integrations", facts.times * SECONDS_PER_DAY), ("channels", facts.frequencies)):
+                if values.size > 2 and np.ptp(np.diff(values)) > CALFITS_TOLERANCE:
+                    raise InputError(
+                        f"also: calfits holds gains at equal distances, and the {what} of the data have gaps; take "
+                        f"h5parm, or {GAINS} alone"
+                    )
         return cls(content, Parts({WHOLE: facts}))
 
     @property
@@ -266,9 +276,14 @@ class DataCalibration(DataStudy):
 
     def _without_start(self, gains: UVCal) -> list[str]:
         """Return a sentence if the data have antennas, channels or single samples without a gain to start from."""
-        facts = self.data.facts[WHOLE]
-        values, flags = solutions(gains, self.frames[0].numbers, facts.frequencies, np.array(facts.polarizations))
-        unknown = (flags | ~np.isfinite(values) | (values == 0))[:, :, closest_solutions(gains, facts.times)]
+        facts, frame = self.data.facts[WHOLE], self.frames[0]
+        numbers = frame.numbers[np.unique(frame.antennas[~frame.autos])]
+        known = np.isin(numbers, gains.ant_array)
+        times = closest_solutions(gains, facts.times)
+        values, flags = solutions(gains, numbers[known], facts.frequencies, np.array(facts.polarizations))
+        unknown = np.ones((numbers.size, *values.shape[1:]), bool)
+        unknown[known] = flags | ~np.isfinite(values) | (values == 0)
+        unknown = unknown[:, :, times]
         antennas = unknown.all(axis=(1, 2, 3))
         channels = unknown[~antennas].all(axis=(0, 2, 3))
         samples = unknown[~antennas][:, ~channels]

@@ -34,8 +34,8 @@ from calstudy.calibrate.calibrators.given_gains import (
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.experiment.assumed import assumed_world
 from calstudy.experiment.model import Experiment
-from calstudy.products.corruption import LEVELS
-from calstudy.products.files import DATA, VISIBILITIES, read_json, read_visibilities, write_visibilities
+from calstudy.products.corruption import read_noise
+from calstudy.products.files import DATA, VISIBILITIES, read_visibilities, write_visibilities
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Product, Store, require_writable
 from calstudy.studies.capacity import fit
@@ -162,7 +162,7 @@ def _write_world(content: WorldData, products: Mapping[str, Product], folder: Pa
         data=tuple(sets),
         sky_model=None if model is None else f"{SKY_MODEL}.{file_format}",
         sky_model_digest=None if model is None else salted(model.key, content.salt),
-        noise=None if level is None else read_json(products[level.key].path / LEVELS)["noise_std"],
+        noise=None if level is None else read_noise(products[level.key].path),
     )
     write(folder / README, _readme(manifest, template, file_format))
     write(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pyuvdata.utils import uvcalibrate
 from toy import HEX, make_toy, scattered
-from toy_data import ONE_SOLVE, SETTINGS, make_uvdata
+from toy_data import ONE_SOLVE, SETTINGS, make_uvdata, sky_of
 
 from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
 from calstudy.calibrate.calibrators.least_squares import Calamity, CalamityRedundant, SkyBased
@@ -60,6 +60,17 @@ def test_products_follow_pyuvdatas_conventions(data, result):
     calibrated = uvcalibrate(raw, gains, inplace=False)
     expected = to_cube(result.model) + to_cube(result.residual)
     assert np.abs(to_cube(calibrated) - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("prior", "unit", "convention"), [("sky-model", "Jy", "avg"), ("gains", "uncalib", None)])
+def test_calibrated_data_have_the_unit_of_what_fixes_their_scale(toy, data, prior, unit, convention):
+    raw, sky = data.copy(), sky_of(data, toy.foregrounds)
+    raw.vis_units, raw.pol_convention, sky.pol_convention = "uncalib", None, "avg"
+    found = run_calibrator(Calamity(prior=prior, solver=GaussNewtonSettings(max_steps=1)), raw, sky)
+    assert (found.gains.gain_scale, found.gains.pol_convention) == (unit, convention)
+    for uvd in (found.model, found.residual):
+        assert (uvd.vis_units, uvd.pol_convention) == (unit, convention)
+        uvd.check()
 
 
 def test_residual_is_at_the_noise(toy, result):

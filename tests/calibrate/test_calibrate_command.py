@@ -22,11 +22,16 @@ import calstudy
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import make_uvcal
+from calstudy.base.observation import Observation
 from calstudy.calibrate.expected_loss import ExpectedTransfer
+from calstudy.calibrate.settings import FileWeights
+from calstudy.calibrate.weights import make_weights
 from calstudy.cli import main as cli
 from calstudy.cli.calibrate import _calibration
 from calstudy.interface import CalibratedData
 from calstudy.power.tables import load_spectrum
+from calstudy.realdata.reading import prepare, read_visibilities
+from calstudy.realdata.selection import Selection
 from calstudy.realdata.settings import defaults
 from calstudy.studies.calibration import FIGURE_FILES, IN_USE, DataCalibration, calibration_file
 
@@ -318,7 +323,7 @@ def test_mistakes_are_one_sentence(command, data, arguments, sentence):
     ("arguments", "sentence"),
     [
         (["--weights", "autos"], "weights: 'autos' needs autocorrelations, which the data lack for antenna"),
-        (["--weights", "weights.h5"], "the channels of the weights are not those of the data"),
+        (["--weights", "weights.h5"], "no weights for some channels of the data"),
         (["--gains", "gains.calh5"], "gains: no solution for antenna(s) 16, 18, 20, 22, 24 of the data"),
         (["--gains", "flagged.calh5"], "gains: all are flagged, zero or not finite"),
         (["--sky-model", "dark.uvh5"], "sky model: where the data are, all of it is zero or flagged"),
@@ -355,6 +360,54 @@ def test_gains_that_are_not_known_to_start_from_are_counted(command, data, tmp_p
         code, text = command(data, *OPTIONS, "--gains", "gains.calh5", *others)
         assert code == 0
         assert f"No gains to start from are known {told}" in text
+
+
+def test_antennas_of_autocorrelations_alone_need_no_gains_to_start_from(command, tmp_path):
+    """An outrigger that the sky model lacks leaves its autocorrelation in the data."""
+    sky = make_uvdata(make_toy(scattered(6)), 2)
+    numbers = np.union1d(sky.ant_1_array, sky.ant_2_array)
+    part = sky.select(antenna_nums=numbers[:-1], inplace=False)
+    with_autos(sky, 10.0).write_uvh5(str(tmp_path / "data.uvh5"))
+    part.write_uvh5(str(tmp_path / "sky.uvh5"))
+    gains = make_uvcal(sky, np.ones((sky.telescope.Nants, sky.Nfreqs, 2, 1), complex))
+    gains.select(antenna_nums=numbers[:-1])
+    gains.write_calh5(str(tmp_path / "gains.calh5"))
+    files = ["--sky-model", "sky.uvh5", "--gains", "gains.calh5"]
+    code, told = command("data.uvh5", *OPTIONS, *files, "--dry-run")
+    assert code == 0, told
+    assert "No gains to start from" not in told
+
+
+def test_calfits_of_data_with_gaps_are_refused_before_the_solves(command, data):
+    uvd = UVData.from_file(str(data))
+    gap = uvd.select(freq_chans=[*range(20), *range(30, 64)], inplace=False)
+    gap.write_uvh5(str(data), clobber=True)
+    for others in (["--dry-run"], ["--output", "out"]):
+        code, told = command(data, *OPTIONS, "--also", "calfits", *others)
+        assert code == 2
+        assert "the channels of the data have gaps" in told
+
+
+def test_weights_of_a_file_are_found_for_turned_and_reordered_data(command, data, tmp_path):
+    """Calibration brings data to an order and a direction of its own."""
+    uvd = UVData.from_file(str(data))
+    weights = UVFlag(uvd, mode="metric")
+    weights.metric_array = np.tile(uvd.freq_array[:, None] / 1e8, (uvd.Nblts, 1, 1))
+    weights.write(str(tmp_path / "weights.h5"))
+    uvd.reorder_freqs(channel_order="-freq")
+    uvd.conjugate_bls(np.flatnonzero((uvd.time_array > uvd.time_array.min()) & (np.arange(uvd.Nblts) % 2 == 0)))
+    uvd.blts_are_rectangular = False
+    uvd.write_uvh5(str(data), clobber=True)
+    code, told = command(
+        data, *OPTIONS, "--weights", "weights.h5", "--select", "frequencies=165 MHz..180 MHz", "--dry-run"
+    )
+    assert code == 0, told
+    prepared, _ = prepare(read_visibilities([data]), Selection(frequencies=(165e6, 180e6)))
+    observation = Observation(prepared)
+    settings = FileWeights(kind="file", path=tmp_path / "weights.h5")
+    found = make_weights(observation, np.ones(observation.n_baselines, bool), settings)
+    ratio = found / observation.frequencies[:, None]
+    assert np.ptp(ratio[found > 0]) < 1e-6 * ratio.max()
 
 
 def test_a_dry_run_says_that_integrations_are_days_apart(command, data):

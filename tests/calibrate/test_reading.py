@@ -15,7 +15,7 @@ from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cub
 from calstudy.calibrate.sky_model import match_sky_model
 from calstudy.instrument.telescope import make_template
 from calstudy.realdata.halves import read_facts
-from calstudy.realdata.reading import prepare, read_visibilities
+from calstudy.realdata.reading import prepare, read_visibilities, share_times
 from calstudy.realdata.selection import Selection, antenna_text, parse_values, select, split_selections
 
 
@@ -90,9 +90,12 @@ def test_samples_of_no_measurement_are_flagged_and_counted(data):
     prepared, notes = prepare(data)
     assert prepared.flag_array[5, 3].all()
     assert notes == ["1 samples are of no measurement (nsamples of 0) and were flagged."]
-    # Where none is counted, nothing is known.
+    # Programs that do not count leave all at zero: averages would be zero, and weights too.
     data.nsample_array[:] = 0
-    assert prepare(data)[1] == []
+    uncounted, notes = prepare(data)
+    assert notes == ["The file does not count measurements (all nsamples are 0); each sample counts as one."]
+    assert (uncounted.nsample_array == 1).all()
+    assert not uncounted.flag_array[5, 3].any()
 
 
 def test_values_that_are_not_finite_are_flagged_and_counted(data):
@@ -135,6 +138,28 @@ def test_a_plan_has_the_times_of_data_whose_averaging_differs(toy, tmp_path, tim
     assert np.array_equal(facts.times, np.unique(prepared.time_array))
     assert np.array_equal(facts.frame.pairs, antenna_pairs(prepared))
     assert facts.integration == prepared.integration_time[0]
+    assert facts.copied
+
+
+@pytest.mark.parametrize("case", ["last integration", "exposures"])
+def test_durations_that_differ_alike_for_all_baselines_are_counts(toy, case):
+    """Nothing is copied: copies would put the noise of one sample into both halves of the data."""
+    data = make_uvdata(toy, 9)
+    if case == "last integration":
+        data.downsample_in_time(n_times_to_avg=4, allow_drift=True, keep_ragged=True)
+    else:
+        # Programs write the time of unflagged samples.
+        data.integration_time[[3, 30]] *= 0.5
+    exposure = data.integration_time[:, None, None] * data.nsample_array
+    prepared, notes = prepare(data)
+    assert prepared.Nblts == data.Nblts
+    assert np.ptp(prepared.integration_time) == 0
+    order = np.lexsort((data.baseline_array, data.time_array))
+    assert np.allclose(prepared.integration_time[:, None, None] * prepared.nsample_array, exposure[order])
+    assert "with nsamples in proportion" in notes[-1]
+    metadata = data.copy(metadata_only=True)
+    assert share_times(metadata, []) is False
+    assert np.allclose(metadata.integration_time, prepared.integration_time[0])
 
 
 def test_cross_hands_are_left_out_and_told(toy):

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from observations import small_instrument
+from observations import small_instrument, with_autos
 from pyuvdata import UVData
 
 from calstudy.base.errors import ExperimentError, InputError
-from calstudy.base.visibilities import antenna_pairs, from_cube, to_cube
+from calstudy.base.feeds import rename_feeds
+from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, to_cube
 from calstudy.instrument.telescope import make_template
-from calstudy.products.files import DATA
-from calstudy.products.observed import observed
+from calstudy.products.files import DATA, VISIBILITIES
+from calstudy.products.observed import observed, read_observed
 from calstudy.realdata import reading
 from calstudy.realdata.halves import PARITIES
 from calstudy.realdata.noise import radiometer_variance
@@ -225,6 +226,114 @@ def test_a_sky_model_without_directions_has_the_feeds_of_the_data(tmp_path):
     found, sky, notes = observed(graph, "even").read()
     assert np.array_equal(to_cube(sky), to_cube(found))
     assert "Sky model: The file does not tell the orientation of its feeds; x is taken to be north." in notes
+
+
+def test_polarizations_of_a_sky_model_are_selected_by_direction(tmp_path):
+    """HERA calls the northern feed x, and most simulators the eastern one."""
+    data = measurement(polarizations=("xx", "yy"))
+    data.write_uvh5(tmp_path / "sky.uvh5")
+    rename_feeds(data, "north")
+    data.write_uvh5(tmp_path / "data.uvh5")
+    section = {"data": "data.uvh5", "sky_model": "sky.uvh5", "select": {"polarizations": "xx"}}
+    found, sky, _ = observed(study(tmp_path, section).graph, "even").read()
+    assert list(found.polarization_array) == [-6]
+    assert np.array_equal(to_cube(sky), to_cube(found))
+
+
+@pytest.mark.parametrize("autos", [False, True])
+def test_samples_that_a_sky_model_lacks_are_flagged(tmp_path, autos):
+    """Else the sky would be zero there, and the data all residual."""
+    data = measurement()
+    sky = data.copy()
+    sky.flag_array[:, 3], sky.data_array[:, 3] = True, 0
+    sky.select(blt_inds=np.delete(np.arange(sky.Nblts), 2 * sky.Nbls), run_check=False)
+    sky.blts_are_rectangular = False
+    sky.write_uvh5(tmp_path / "sky.uvh5", run_check=False)
+    (with_autos(data, 1e3) if autos else data).write_uvh5(tmp_path / "data.uvh5")
+    found, model, notes = observed(study(tmp_path, {"data": "data.uvh5", "sky_model": "sky.uvh5"}).graph, "even").read()
+    crosses = np.not_equal(*antenna_pairs(found).T)
+    flags = flag_cube(found)
+    lacking = flags[:, crosses]
+    assert lacking[:, :, 3].all()
+    assert lacking[1].all(axis=(1, 2)).sum() == 1
+    assert lacking.mean() == pytest.approx(np.mean(to_cube(model)[:, crosses] == 0))
+    # Weights may need the autocorrelations, of which a sky model has none.
+    assert not flags[:, ~crosses].any()
+    assert any("flagged in the sky model, or missing there" in note for note in notes)
+
+
+CONVENTIONS = ("sum", "avg")
+
+
+@pytest.mark.parametrize("of_data", [*CONVENTIONS, "uncalib"])
+@pytest.mark.parametrize("of_sky", CONVENTIONS)
+def test_halves_and_their_sky_model_have_one_convention(tmp_path, of_data, of_sky):
+    """The same sky, in Jy of two conventions: I is the sum of both polarizations, or their average."""
+    intensity = measurement()
+    for name, convention in (("data", of_data), ("sky", of_sky)):
+        written = intensity.copy()
+        written.data_array = intensity.data_array * (2 if convention == "avg" else 1)
+        written.pol_convention = convention
+        if convention == "uncalib":
+            written.vis_units, written.pol_convention = "uncalib", None
+        written.write_uvh5(tmp_path / f"{name}.uvh5")
+    task = observed(study(tmp_path, {"data": "data.uvh5", "sky_model": "sky.uvh5"}).graph, "even")
+    (tmp_path / "made").mkdir()
+    task.make(tmp_path / "made")
+    for name in (DATA, VISIBILITIES):
+        found = UVData.from_file(tmp_path / "made" / name, run_check=False)
+        assert (found.vis_units, found.pol_convention) == ("Jy", "sum")
+        np.testing.assert_allclose(found.data_array[: found.Nbls], intensity.data_array[: found.Nbls], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("said", "factor"), [(None, 1), ("sum", 1), ("avg", 2)])
+def test_a_convention_that_a_file_does_not_tell_is_that_of_the_study(tmp_path, said, factor):
+    data = measurement()
+    data.pol_convention = None
+    data.write_uvh5(tmp_path / "data.uvh5")
+    section = {"data": "data.uvh5"} | ({} if said is None else {"pol_convention": said})
+    measured = study(tmp_path, section)
+    assert measured.stand_ins == (("I = XX + YY (pol_convention)",) if said is None else ())
+    modelled = study(tmp_path, {**section, "sky_model": "data.uvh5"})
+    assert modelled.stand_ins == measured.stand_ins
+    found, _, notes = observed(measured.graph, "even").read()
+    rows = slice(found.Nbls)
+    np.testing.assert_allclose(factor * found.data_array[rows], data.data_array[rows], rtol=1e-6)
+    assert any("does not tell" in note for note in notes) == (said is None)
+
+
+def differently_averaged() -> UVData:
+    """Baselines of antenna 0 have half the duration of the others, and twice the samples."""
+    data = measurement()
+    short = data.ant_1_array == data.telescope.antenna_numbers[0]
+    whole, averaged = (data.select(blt_inds=np.flatnonzero(chosen), inplace=False) for chosen in (short, ~short))
+    averaged.downsample_in_time(n_times_to_avg=2, allow_drift=True)
+    return whole + averaged
+
+
+def test_copies_of_a_sample_are_not_put_into_both_halves(tmp_path):
+    data = differently_averaged()
+    data.write_uvh5(tmp_path / "data.uvh5")
+    with pytest.raises(InputError, match="alternating integrations would share samples"):
+        study(tmp_path, {"data": "data.uvh5"})
+    found = study(tmp_path, {"data": "data.uvh5", "difference": "data.uvh5"})
+    times = found.data.times("even")
+    read, _, _ = observed(found.graph, "even").read()
+    # The two samples of a correlator have half the duration of their sum, at its time.
+    assert np.array_equal(np.unique(read.time_array), times)
+    assert not read.flag_array.any()
+    assert np.allclose(read.integration_time, 5.0)
+
+
+def test_noise_that_flagged_autocorrelations_do_not_tell_is_asked_for(tmp_path):
+    data = with_autos(measurement(), 1e3)
+    data.flag_array[data.ant_1_array == data.ant_2_array] = True
+    data.write_uvh5(tmp_path / "data.uvh5")
+    graph = study(tmp_path, {"data": "data.uvh5", "sky_model": "data.uvh5"}, calibrator="unified").graph
+    (tmp_path / "made").mkdir()
+    observed(graph, "even").make(tmp_path / "made")
+    with pytest.raises(InputError, match=r"foreground_prior\.noise: must be given"):
+        read_observed(tmp_path / "made", graph.experiment.calibration, True)
 
 
 def test_sums_and_differences_of_a_correlator_give_back_its_two_samples(tmp_path):

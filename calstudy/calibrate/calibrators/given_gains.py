@@ -43,6 +43,11 @@ class NoCalibration(Calibrator):
 
     calibrator: str = "none"
 
+    @property
+    def on_sky_scale(self) -> bool:
+        """False: gains are given."""
+        return False
+
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return a sentence if there is no sky model to subtract."""
         return None if has_sky_model else "needs a sky model, and there is none"
@@ -88,6 +93,11 @@ class ByFile(Calibrator):
     )
 
     salt: str = Field("", description="Of the blind challenge that the data are of.", json_schema_extra=UNKEYED)
+
+    @property
+    def on_sky_scale(self) -> bool:
+        """False: gains are given."""
+        return False
 
     @model_validator(mode="after")
     def _says_where(self) -> Self:

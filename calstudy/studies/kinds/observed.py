@@ -17,7 +17,7 @@ from calstudy.instrument.interface import model_of
 from calstudy.power.interface import require_antennas
 from calstudy.power.settings import PowerSettings
 from calstudy.products.table import tables_of
-from calstudy.realdata.halves import PARITIES, Parts, require_same_samples, require_same_sky
+from calstudy.realdata.halves import PARITIES, Parts, pol_convention_of, require_same_samples, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
@@ -61,10 +61,13 @@ class ObservedStudy(DataStudy):
     @property
     def stand_ins(self) -> tuple[str, ...]:
         """Assumptions about the units of the power spectra."""
-        scale = self.file.observed.flux_scale
-        if scale is None or scale.kind == "factor":
-            return ()
-        return ("flux scale: autocorrelations at an assumed system temperature",)
+        section, sky = self.file.observed, self.file.observed.sky_model
+        assumed = section.flux_scale is not None and section.flux_scale.kind != "factor"
+        found = ("flux scale: autocorrelations at an assumed system temperature",) if assumed else ()
+        if (assumed and sky is None) or section.pol_convention is not None:
+            return found
+        told = self.data.facts["even"].pol_convention if sky is None else pol_convention_of(sky)
+        return found if told else (*found, "I = XX + YY (pol_convention)")
 
     @property
     def setup(self) -> str:
@@ -139,6 +142,12 @@ def _halves(file: ObservedFile) -> Parts:
         raise InputError(
             f"observed.data: {even.times.size} integration; two are needed, for even and odd, or other data of the "
             "same sky as observed.odd, or what the correlator writes of differences as observed.difference"
+        )
+    elif even.copied:
+        raise InputError(
+            "observed.data: baselines are averaged over different times, and alternating integrations would share "
+            "samples; give other data of the same sky as observed.odd, or average all baselines alike "
+            "(pyuvdata: downsample_in_time)"
         )
     if even.unit.lower() != "jy" and section.flux_scale is None and section.sky_model is None:
         raise InputError(
