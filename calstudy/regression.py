@@ -172,6 +172,11 @@ def _without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
     return {**content, "outputs": outputs}
 
 
+def has_results(reference: Path) -> bool:
+    """Whether the study of a reference folder has results to compare; sweeps have none of their own."""
+    return load_study(reference / EXPERIMENT).has_reference
+
+
 def remake(reference: Path, overrides: Sequence[str], budget: Budget, console: Console) -> Path:
     """Run the study of a reference folder with ``path=value`` overrides, and return the run's folder.
 

@@ -12,7 +12,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.instrument.layouts import make_array, redundant_groups
 from calstudy.power.realizations import Design, mean_over_bins
-from calstudy.products.files import read_arrays
+from calstudy.results.reader import arrays_of_figure
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
@@ -33,7 +33,7 @@ class PooledResults:
     @classmethod
     def of(cls, experiment: Experiment, folder: Path) -> PooledResults:
         """Read the arrays from the folder of the figure."""
-        return cls(experiment, read_arrays(folder / ARRAYS))
+        return cls(experiment, arrays_of_figure(folder / ARRAYS))
 
     @property
     def name(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,9 @@ from calstudy.base.errors import InputError
 from calstudy.cli.options import AsJson, MaxMemory, Runs, Scheduler, Set, Workers, with_runs
 
 if TYPE_CHECKING:
-    from calstudy.regression import Regression
+    from collections.abc import Sequence
+
+    from calstudy.run.execution import Budget
 
 
 EXIT_MOVED = 1
@@ -46,7 +49,7 @@ def regress(
     folder that does not exist becomes a new reference.
     """
     from calstudy.base.package_files import reference_folder
-    from calstudy.regression import accept, find_references, remake, require_same_study, show, write_json
+    from calstudy.regression import accept, find_references
     from calstudy.run.execution import Budget
 
     console = Console(soft_wrap=True, highlight=False)
@@ -62,31 +65,70 @@ def regress(
     references = find_references(folders or ([] if against else [reference_folder()]))
     if against is not None and len(references) != 1:
         raise InputError("--against RUN: give the one reference folder that the run is to be compared with")
-    made, holds = {}, True
+    references = references if len(references) == 1 else _with_results(references, console)
+    budget = Budget(workers, max_memory, scheduler)
+    made, holds = {}, []
     for reference in references:
-        run = against or remake(reference, overrides or (), Budget(workers, max_memory, scheduler), console)
-        if update:
-            require_same_study(reference, run)
-        regression = _compare(reference, run)
-        show(regression, console)
-        write_json(regression, run)
-        made[reference] = run
-        holds = holds and (regression.holds or update)
+        run = against or _made_again(reference, overrides or (), budget, console, alone=len(references) == 1)
+        holds.append(run is not None and (_compare(reference, run, update, console) or update))
+        if run is not None:
+            made[reference] = run
     # After all runs, because their manifests would otherwise record a changed checkout.
     for reference, run in made.items() if update else ():
         accept(run, reference)
         console.print(f"{reference}: updated", markup=False)
-    if not holds:
+    if not all(holds):
         raise typer.Exit(EXIT_MOVED)
 
 
-def _compare(reference: Path, run: Path) -> Regression:
-    from calstudy.regression import Regression, compare_claims, compare_figures, read_reference, read_run
+def _with_results(references: list[Path], console: Console) -> list[Path]:
+    """Leave out studies without results of their own, such as sweeps, and name them."""
+    from calstudy.regression import has_results
 
-    old, new = read_reference(reference), read_run(run)
-    claims = compare_claims(old.claims, new.claims, old.on_machines) if old.claims else []
-    figures = compare_figures(old.figures, new.figures, old.tolerances)
-    return Regression(str(reference), str(run), figures, claims)
+    found = []
+    for reference in references:
+        # A study that cannot be read is named in its turn.
+        with suppress(InputError):
+            if not has_results(reference):
+                console.print(
+                    f"{reference}: left out, for its study has no results of its own to compare", markup=False
+                )
+                continue
+        found.append(reference)
+    return found
+
+
+def _made_again(
+    reference: Path, overrides: Sequence[str], budget: Budget, console: Console, alone: bool
+) -> Path | None:
+    """Make a reference again; one of several that cannot be made is named, and the others are not lost."""
+    from calstudy.regression import remake
+
+    try:
+        return remake(reference, overrides, budget, console)
+    except InputError as error:
+        if alone:
+            raise
+        console.print(f"{reference}: NOT MADE AGAIN: {error}", markup=False)
+        return None
+
+
+def _compare(reference: Path, run: Path, update: bool, console: Console) -> bool:
+    """Show how a run compares with a reference, write it to its folder, and return whether the reference holds.
+
+    Raises InputError if the run is of another study and would take its place (`update`).
+    """
+    from calstudy import regression
+
+    if update:
+        regression.require_same_study(reference, run)
+    old, new = regression.read_reference(reference), regression.read_run(run)
+    claims = regression.compare_claims(old.claims, new.claims, old.on_machines) if old.claims else []
+    figures = regression.compare_figures(old.figures, new.figures, old.tolerances)
+    found = regression.Regression(str(reference), str(run), figures, claims)
+    regression.show(found, console)
+    regression.write_json(found, run)
+    return found.holds
 
 
 EXIT_FAILED = 1

@@ -38,7 +38,7 @@ def export(
     """
     from calstudy.products.files import quiet_libraries
     from calstudy.run.execution import Budget
-    from calstudy.studies.export import CARRIER, folders_of, write_recipe
+    from calstudy.studies.export import CARRIER, folders_of, require_worlds, write_recipe
     from calstudy.studies.export import export as write
     from calstudy.studies.kinds.comparison import load_worlds
 
@@ -47,6 +47,7 @@ def export(
     if blind is not None:
         # Nothing is promised of data that cannot be written.
         folders_of(worlds, output, file_format, overwrite)
+        require_worlds(worlds)
         digest = write_recipe(load_worlds(file, scale, overrides or (), None), blind)
         console.print(f"SHA-256 of {blind}, to be published: {digest}", markup=False)
         worlds = load_worlds(blind, None, (), CARRIER)

@@ -13,7 +13,7 @@ from rich.console import Console
 from calstudy.base.errors import InputError
 
 if TYPE_CHECKING:
-    from calstudy.run.store import Product, Store
+    from calstudy.run.store import Leftover, Product, Store
 
 RunsFolder = Annotated[Path, typer.Argument(help="Folder of run folders.")]
 StoreFolder = Annotated[Path, typer.Argument(help="Folder of products.")]
@@ -83,24 +83,25 @@ def store(
     chosen = [product for product in chosen if age_of(product) >= oldest and product.size >= smallest]
     console = Console(highlight=False)
     _show(chosen, folder, console)
-    left = [item for item in leftovers(where) if item.age >= oldest]
+    left = [item for item in leftovers(where) if item.age >= oldest and item.size >= smallest]
     for item in left:
         age = f"{item.age / SECONDS['d']:.1f} d"
         console.print(f"leftover of a run: {item.path}, {_size(item.size)}, {age}", markup=False)
     if not delete:
         return
-    if older_than is not None:
-        for item in left:
-            shutil.rmtree(item.path, ignore_errors=True)
-            console.print(f"deleted: {item.path}", markup=False)
-    _delete(chosen, where, console)
+    _delete(chosen, left if older_than is not None else [], where, console)
 
 
-def _delete(chosen: list[Product], store: Store, console: Console) -> None:
+def _delete(chosen: list[Product], left: list[Leftover], store: Store, console: Console) -> None:
     from calstudy.run.store import LEASE_LOCK, needed_by_runs
 
     with store.lock(*LEASE_LOCK):
         needed = needed_by_runs(store)
+        for item in left:
+            if item.key not in needed:
+                shutil.rmtree(item.path, ignore_errors=True)
+            done = "kept, for a run may be filling it" if item.key in needed else "deleted"
+            console.print(f"{done}: {item.path}", markup=False)
         for product in chosen:
             stage, key = str(product.record["stage"]), str(product.record["key"])
             if key not in needed:

@@ -75,6 +75,20 @@ def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np
     return np.stack([noise.autocorrelations(frequencies, area) for area in areas], axis=-1) / np.sqrt(samples)
 
 
+def eor_factor(foreground_rms: float, eor_rms: float, level: float | None) -> float:
+    """Return the factor that scales the EoR to a level below the foregrounds in decibels; one if that is None.
+
+    The rms are those of the simulated visibilities, Jy. Raise InputError if one of them is zero that is needed.
+    """
+    if eor_rms <= 0:
+        raise InputError("sky.eor: its visibilities are all zero")
+    if level is None:
+        return 1.0
+    if foreground_rms <= 0:
+        raise InputError("corruption.eor_level: the foregrounds it refers to are all zero")
+    return 10 ** (level / 10) * foreground_rms / eor_rms
+
+
 def set_levels(
     foreground_rms: float, eor_rms: float, settings: CorruptionSettings, radiometer: np.ndarray | None = None
 ) -> Levels:
@@ -86,13 +100,7 @@ def set_levels(
     The rms of the simulated visibilities and the standard deviation of radiometer noise, (Nfreqs, Npols)
     (`radiometer_std`), are in Jy. Raise InputError if a component is zero that must be scaled, or scaled to.
     """
-    if eor_rms <= 0:
-        raise InputError("sky.eor: its visibilities are all zero")
-    factor = 1.0
-    if settings.eor_level is not None:
-        if foreground_rms <= 0:
-            raise InputError("corruption.eor_level: the foregrounds it refers to are all zero")
-        factor = 10 ** (settings.eor_level / 10) * foreground_rms / eor_rms
+    factor = eor_factor(foreground_rms, eor_rms, settings.eor_level)
     noise, spectrum = settings.noise, None
     if noise.kind == "none":
         std = 0.0

@@ -23,6 +23,7 @@ from calstudy.products.graph import required
 from calstudy.products.score import score
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.standing import LIMIT, SIGMAS, upper_limit
+from calstudy.verdicts.tolerances import Arrays, Drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -207,6 +208,16 @@ def _name(published: Sequence[PublishedTolerance], axes: Axes) -> None:
         )
 
 
+def _rounding(arrays: Arrays, name: str) -> np.ndarray:
+    """Return a thousandth of a law or its terms in sigma^2 and sigma^4, and of the EoR.
+
+    Bands of one law differ by ten orders of magnitude. Below the EoR they are lost in the rounding of the foregrounds.
+    """
+    power = np.array([2, 4])[:, None] if "terms" in name else 0
+    eor = arrays[f"{name.rpartition('.')[0]}.sigma"] ** -np.asarray(power, float)
+    return np.asarray(1e-3 * (np.abs(arrays[name]) + eor))
+
+
 class GainTolerance(StudyFigure):
     """The rms of gain errors at which the bias is a tenth of the EoR, against their correlation in frequency."""
 
@@ -223,6 +234,7 @@ class GainTolerance(StudyFigure):
         "measured (points, 95 % bars; arrows: lower limits) and by the law (lines)."
     )
     sections = ("corruption.eor_level",)
+    tolerances = ((r".*\.law\.(bias|terms|terms_at)", Drawn(_rounding, "a thousandth of it and of the EoR")),)
 
     def captioned(self) -> str:
         """Return the caption with the sources and reasons of the published tolerances."""

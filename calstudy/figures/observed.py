@@ -19,6 +19,7 @@ from calstudy.products.observed_results import observed_spectra
 from calstudy.products.signal_loss import REGIONS
 from calstudy.results.reader import Tables
 from calstudy.run.task import Job, Task
+from calstudy.verdicts.standing import HIGHEST, LOWEST
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
@@ -139,7 +140,8 @@ def draw_observed_loss(loss: SignalLoss, buffer: float) -> Figure:
     if loss.expected is not None:
         label = f"expected of the fit, outside {where}"
         axes.plot(loss.expected.k, loss.expected.outside, color=style.BLUE, linewidth=0.9, label=label)
-    axes.set_ylim(-0.03, 1.15)
+    # All that counts as measured.
+    axes.set_ylim(LOWEST - 0.02, HIGHEST + 0.02)
     axes.legend(loc="lower right")
     return figure
 

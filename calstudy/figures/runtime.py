@@ -111,9 +111,10 @@ class Runtime(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Draw the time per step against the number of antennas, or against the longest baseline."""
-        series = _series([read_json(folder / CASE) for folder in job.inputs.values()])
+        cases = [read_json(folder / CASE) for folder in job.inputs.values()]
+        series = _series(cases)
         label, symbol = AXES[self.panel]
-        clock = "time" if len(series) > len(SHOWN) else "processor time"
+        clock = "processor time" if {case["device"] for case in cases} == {"cpu"} else "time"
         figure = draw_runtime(series, label, symbol, f"{clock} per step, or solve (s)")
         notes = {item.label: f"{item.fit.exponent:.2f} ± {item.fit.error:.2f}" for item in series}
         return Drawing(figure, series, notes)
@@ -127,6 +128,6 @@ def _series(cases: Sequence[Mapping[str, Any]]) -> list[RuntimeSeries]:
         found = sorted((case for case in cases if case["device"] == device), key=lambda case: case["size"])
         sizes = [case["size"] for case in found]
         for kind, label in SHOWN.items():
-            shown = label if len(devices) == 1 else f"{label}, {CLOCKS[device]}"
+            shown = label if devices == ["cpu"] else f"{label}, {CLOCKS[device]}"
             series.append(summarize_runtime(shown, sizes, [case["seconds"][kind] for case in found]))
     return series

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
+from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
-from calstudy.corrupt.levels import rms, set_levels
+from calstudy.corrupt.levels import eor_factor, rms
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
@@ -87,6 +88,8 @@ def count_sources(sky: SkyModel) -> SourceCounts:
     from calstudy.sky.foregrounds import in_complete_area
     from calstudy.sky.spectra import at_frequencies
 
+    if sky.spectral_type == "full":
+        raise InputError("source-counts: need fluxes at 200 MHz, and the sky has them by channel alone")
     if sky.spectral_type != "flat":
         sky = at_frequencies(sky, np.array([FREQUENCY]))
     flux = sky.stokes[0, 0].to_value("Jy")
@@ -214,14 +217,14 @@ def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment)
     The beam, power section and levels are those of the experiment.
     """
     settings = experiment.power
-    levels = set_levels(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption)
+    factor = eor_factor(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption.eor_level)
     of_foregrounds, of_eor = (_delay_spectra(data, experiment) for data in (foregrounds, eor))
     spectrum = spherical_average(of_eor, settings, exclude_wedge=False)
     return SimulatedComponents(
         wedge=cylindrical_average(of_foregrounds, settings),
         eor=with_errors(spectrum, signal=spectrum),
         expected=input_power(experiment.sky.eor, spectrum.k, settings.cosmology, experiment.instrument.channels.band),
-        baselines=_baselines(foregrounds, eor, levels.eor_factor, settings.taper),
+        baselines=_baselines(foregrounds, eor, factor, settings.taper),
         buffer=settings.wedge_buffer,
     )
 

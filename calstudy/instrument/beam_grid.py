@@ -25,6 +25,8 @@ DEGREE_NSIDE = 64
 SPLINE_DEGREE = 5
 # In a ring of n pixels, orders that exceed (n - 1) / 2 by this are zero: amplitudes grow as a power of the angle.
 UNRESOLVED = 2
+# Part of the power at the zenith that has one direction for all azimuths, and part of the peak's that is at the zenith.
+LEAST_DIRECTED, LEAST_ZENITH = 0.9, 1e-3
 # Rings below the horizon that splines may use (rad).
 BELOW = np.radians(15)
 
@@ -58,7 +60,24 @@ def read_beamfits(path: Path) -> UVBeam:
         raise InputError(f"instrument.beam.path: feed x of {path} is not east-west, which it must be")
     if beam.pixel_coordinate_system == "az_za":
         _require_whole_sky(beam, path)
-    return _on_grid(beam, feeds, path)
+    found = _on_grid(beam, feeds, path)
+    _require_direction(found, path)
+    return found
+
+
+def _require_direction(beam: UVBeam, path: Path) -> None:
+    """Raise InputError unless the field of each feed has one direction at the zenith, that of the feed."""
+    fixed = fixed_components(beam.data_array[:, :, :, 0], beam.axis1_array)
+    mean = np.abs(fixed.mean(axis=-1)) ** 2
+    power, peak = (np.abs(fixed) ** 2).sum(axis=0).mean(axis=-1), (np.abs(beam.data_array) ** 2).sum(axis=0)
+    if (mean.sum(axis=0) < LEAST_DIRECTED * np.maximum(power, LEAST_ZENITH * peak.max(axis=(-2, -1)))).any():
+        raise InputError(
+            f"instrument.beam.path: {path} has fields without a direction at the zenith, as Airy and Gaussian beams of "
+            "pyuvdata, or none there; give vectors along azimuth and zenith angle, or the power (efield_to_power)"
+        )
+    feeds = range(mean.shape[1])
+    if (mean[feeds, feeds] < mean.sum(axis=0) / 2).any():
+        raise InputError(f"instrument.beam.path: feed x of {path} is not east-west at the zenith, which it must be")
 
 
 def _require_whole_sky(beam: UVBeam, path: Path) -> None:

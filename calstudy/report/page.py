@@ -24,7 +24,7 @@ from calstudy.base.files import replacing, rounded
 from calstudy.base.paths import leaves
 from calstudy.base.table import Table
 from calstudy.report.headline import Number, read_headline, read_signal
-from calstudy.results.reader import EXPERIMENT, MANIFEST, RunFolder, Unevaluated
+from calstudy.results.reader import EXPERIMENT, MANIFEST, RunFolder, Unevaluated, arrays_of_figure
 from calstudy.run.progress import duration
 from calstudy.verdicts.standing import advice, standing_table
 from calstudy.verdicts.tables import CLAIMS_JSON, tally, verdict_table
@@ -62,10 +62,9 @@ def read_charts(path: Path) -> list[Chart]:
     `k_perp` and `k_parallel`. Items of lists, which have numbers for names, are left out.
     """
     groups: dict[str, dict[str, np.ndarray]] = {}
-    with np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            group, _, field = name.rpartition(".")
-            groups.setdefault(group, {})[field] = arrays[name]
+    for name, values in arrays_of_figure(path).items():
+        group, _, field = name.rpartition(".")
+        groups.setdefault(group, {})[field] = values
     return [chart for chart in (*_spectra(groups), _transfer(groups), _maps(groups)) if chart is not None]
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import read_gain_errors
+from calstudy.base.kept_arrays import DAMAGE
 from calstudy.base.table import Table, from_json
 from calstudy.calibrate.agreement import Statistic
 from calstudy.calibrate.agreement import from_json as statistics_from_json
@@ -44,7 +45,6 @@ from calstudy.products.files import (
     SKY_MODEL_ERROR,
     TRANSFER,
     TRANSFER_BANDS,
-    read_arrays,
     read_json,
     spectrum_file,
 )
@@ -265,6 +265,16 @@ MANIFEST, EXPERIMENT, SHOWN = "manifest.json", "experiment.yaml", "tables.json"
 NO_RUN = "is not the folder of a finished run; give one that 'calstudy run' printed"
 
 
+def arrays_of_figure(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a figure; raises InputError if the file is damaged or cannot be read."""
+    try:
+        # numpy does not close a damaged file that it opens itself.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return dict(file)
+    except DAMAGE as error:
+        raise InputError(f"{path}: the arrays of the figure cannot be read ({error})") from None
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """The folder of a finished run, or of a reference, whose figures are beside its manifest.
@@ -357,10 +367,7 @@ class RunFolder:
 
     def arrays(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the arrays of all figures, by figure and name."""
-        try:
-            return {path.stem: read_arrays(path) for path in sorted(self.figures.glob("*.npz"))}
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(f"{self.path}: its figures cannot be read ({error})") from None
+        return {path.stem: arrays_of_figure(path) for path in sorted(self.figures.glob("*.npz"))}
 
     def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> list[InBand]:
         """Return how calibrators stand against a limit of the bias, in all or some worlds; empty without comparison."""

@@ -95,8 +95,10 @@ def perform(order: WorkOrder, warn: Callable[[str], None] = logger.warning) -> P
         )
     try:
         with store.lock(order.task.stage.name, order.key, warn):
-            existing = None if order.again else store.verify(order.task.stage.name, order.key)
-            return existing if existing is not None else _make(order, store)
+            existing = store.verify(order.task.stage.name, order.key)
+            if existing is not None and not (order.again and _is_of_other_code(existing, order, store)):
+                return existing
+            return _make(order, store)
     except InputError:
         raise
     except (SystemExit, KeyboardInterrupt) as error:
@@ -156,6 +158,12 @@ def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Product]:
             "going on; run again to rebuild it"
         )
     return {name: product for name, product in products.items() if product is not None}
+
+
+def _is_of_other_code(product: Product, order: WorkOrder, store: Store) -> bool:
+    """Whether another run has not made the product again, by this code and from inputs as they are now."""
+    inputs = [product.record["lineage"] for product in _verified_inputs(order, store).values()]
+    return bool(product.record["lineage"] != lineage(order.made_with, inputs))
 
 
 def _make(order: WorkOrder, store: Store) -> Product:

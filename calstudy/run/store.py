@@ -275,10 +275,11 @@ def products(store: Store) -> Iterator[Product]:
 class Leftover:
     """A folder that a killed run was filling or removing, or that a run is filling now.
 
-    `size` is that of its files in bytes, `age` the time since its last change in seconds.
+    `size` is that of its files in bytes, `age` the time since its last change in seconds, `key` that of its product.
     """
 
     path: Path
+    key: str
     size: int
     age: float
 
@@ -290,7 +291,9 @@ def leftovers(store: Store) -> list[Leftover]:
         with suppress(OSError):  # A run in progress may have renamed it.
             files = [file.stat() for file in (path, *path.rglob("*"))]
             size, changed = sum(file.st_size for file in files[1:]), max(file.st_mtime for file in files)
-            found.append(Leftover(path, size, max(0.0, time.time() - changed)))
+            # As `Store.building` and `Store.discard` name them.
+            key = path.name.split("-")[1]
+            found.append(Leftover(path, key, size, max(0.0, time.time() - changed)))
     return found
 
 

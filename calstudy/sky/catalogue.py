@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from astropy import units
 from astropy.coordinates import SkyCoord
+from astropy.io.registry import IORegistryError
 from astropy.table import Table
 from pyradiosky import SkyModel
 
@@ -87,7 +88,7 @@ def read_gleam_table(path: Path) -> Catalogue:
             # Published tables deviate from the standards (units, VOTable versions). The columns read here are numbers.
             warnings.simplefilter("ignore")
             table = Table.read(path)
-    except (OSError, ValueError, TypeError, IndexError) as error:
+    except (OSError, ValueError, TypeError, IndexError, IORegistryError) as error:
         raise InputError(f"sky.foregrounds.path: {path} cannot be read as a VOTable or FITS table ({error})") from error
     found = {
         key: next((name for name in names if name in table.colnames), None) for key, names in GLEAM_COLUMNS.items()
@@ -95,9 +96,16 @@ def read_gleam_table(path: Path) -> Catalogue:
     missing = ["/".join(GLEAM_COLUMNS[key]) for key, name in found.items() if name is None]
     if missing:
         raise InputError(f"sky.foregrounds.path: {path} is not a GLEAM catalogue, it lacks {', '.join(missing)}")
-    columns: dict[str, np.ndarray] = {
-        key: np.ma.filled(np.ma.asarray(table[found[key]], dtype=float), np.nan) for key in list(found)[1:]
-    }
+    try:
+        columns: dict[str, np.ndarray] = {
+            key: np.ma.filled(np.ma.asarray(table[found[key]], dtype=float), np.nan) for key in list(found)[1:]
+        }
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"sky.foregrounds.path: {path} has text where a GLEAM catalogue has numbers ({error})"
+        ) from None
+    if (np.abs(columns["declination"]) > 90).any():
+        raise InputError(f"sky.foregrounds.path: {path} has declinations beyond 90 deg")
     catalogue = Catalogue(
         np.asarray(table[found["name"]]).astype(str),
         np.deg2rad(columns["right_ascension"]),

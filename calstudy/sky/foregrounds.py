@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -320,6 +321,8 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
     wanted = f"{'the middle of ' if flat else ''}the channels of {span(frequencies)}"
     needed = np.mean(frequencies, keepdims=True) if flat else frequencies
     require_enclosed(sky, needed, f"sky.foregrounds.path: {settings.path}", wanted)
+    if flat and sky.spectral_type == "full":
+        _require_in_band(sky, frequencies, settings.path)
     at_centre = _at_frequency(sky, float(np.mean(frequencies)))
     flux = at_centre.stokes[0, 0].to_value("Jy")
     flux = np.where(np.isfinite(flux), flux, -np.inf)
@@ -340,16 +343,30 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
         )
     chosen = brightest(flux, settings)
     stand_in = f"foregrounds: {len(chosen)} sources of {settings.path.name}"
-    return Foregrounds(sky.select(component_inds=chosen, inplace=False), stand_in)
+    return Foregrounds(_in_order(sky, chosen), stand_in)
+
+
+def _require_in_band(sky: SkyModel, frequencies: np.ndarray, path: Path) -> None:
+    """Raise InputError if a catalogue that is given by channel has none in the band: fluxes are not interpolated."""
+    tabulated = sky.freq_array.to_value("MHz")
+    if not ((tabulated >= frequencies.min() / 1e6) & (tabulated <= frequencies.max() / 1e6)).any():
+        raise InputError(
+            f"sky.foregrounds.path: {path} has fluxes at {', '.join(f'{value:g}' for value in tabulated[:5])} MHz, and "
+            f"at none of {span(frequencies)}; give a table of sub-bands (sky.foregrounds.csv or votable), which is "
+            "interpolated, or a flux in the band"
+        )
 
 
 def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregrounds:
     function = load_function(settings.path, settings.function)
-    with user_code(f"{settings.function} of {settings.path.name}"):
-        sky = function(frequencies.copy(), **settings.options)
     where = f"{settings.function} of {settings.path.name}"
+    with user_code(where):
+        sky, again = (function(frequencies.copy(), **settings.options) for _ in range(2))
     if not isinstance(sky, SkyModel) or sky.component_type != "point":
         raise InputError(f"sky.foregrounds: {where} must return a pyradiosky SkyModel of points")
+    if sky != again:
+        # Each piece of a simulation calls it.
+        raise InputError(f"sky.foregrounds: {where} returns another sky at every call; draw it with a fixed seed")
     if sky.spectral_type == "full" and not _has_frequencies(sky, frequencies):
         raise InputError(f"sky.foregrounds: {where} tabulates fluxes at frequencies other than the channels")
     try:
@@ -361,7 +378,19 @@ def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregr
     flux = _at_frequency(sky, float(np.mean(frequencies))).stokes[0, 0].to_value("Jy")
     order = np.argsort(-flux, kind="stable")
     stand_in = f"foregrounds: {sky.Ncomponents} sources by {where}"
-    return Foregrounds(sky.select(component_inds=order, inplace=False), stand_in)
+    return Foregrounds(_in_order(sky, order), stand_in)
+
+
+def _in_order(sky: SkyModel, chosen: np.ndarray) -> SkyModel:
+    """Return sources of a catalogue in a given order; `SkyModel.select` of all sources leaves the order as it is."""
+    found = sky.copy()
+    for parameter in found:
+        values = getattr(found, parameter)
+        if isinstance(values.form, tuple) and "Ncomponents" in values.form and values.value is not None:
+            # The last axis; names and positions have no other.
+            setattr(found, values.name, values.value[..., chosen])
+    found.Ncomponents = len(chosen)
+    return found
 
 
 def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:
@@ -380,9 +409,12 @@ def _has_frequencies(sky: SkyModel, frequencies: np.ndarray) -> bool:
 
 
 def _in_jansky(sky: SkyModel) -> SkyModel:
-    """Return points with fluxes in Jy, also if they are in K sr; maps stay as they are."""
+    """Return points with fluxes in Jy, also if they are in K sr or another unit; maps stay as they are."""
     if sky.component_type == "point" and sky.stokes.unit.is_equivalent("K sr"):
         sky.kelvin_to_jansky()
+    if sky.component_type == "point" and sky.stokes.unit.is_equivalent("Jy"):
+        # pyuvsim takes the numbers without their unit.
+        sky.stokes = sky.stokes.to("Jy")
     return sky
 
 
@@ -398,17 +430,21 @@ def _read_votable(path: Path, columns: section.VotableColumns) -> SkyModel:
     with warnings.catch_warnings():
         # Published tables stretch the standard (units, versions).
         warnings.simplefilter("ignore")
-        return SkyModel.from_votable_catalog(
-            str(path),
-            table_name=columns.table,
-            id_column=columns.id,
-            lon_column=columns.right_ascension,
-            lat_column=columns.declination,
-            frame="icrs",
-            flux_columns=columns.flux,
-            reference_frequency=frequency,
-            spectral_index_column=columns.spectral_index,
-        )
+        try:
+            return SkyModel.from_votable_catalog(
+                str(path),
+                table_name=columns.table,
+                id_column=columns.id,
+                lon_column=columns.right_ascension,
+                lat_column=columns.declination,
+                frame="icrs",
+                flux_columns=columns.flux,
+                reference_frequency=frequency,
+                spectral_index_column=columns.spectral_index,
+            )
+        except AttributeError as error:
+            # pyradiosky takes every column to have a unit.
+            raise ValueError(f"a column of votable.flux has no unit: {error}") from error
 
 
 def _read(settings: section.FileSources) -> SkyModel:
@@ -427,6 +463,7 @@ def _read(settings: section.FileSources) -> SkyModel:
             return _read_votable(path, settings.votable)
         if settings.csv is not None:
             return read_csv_catalogue(path, settings.csv)
+        _require_known_units(path)
         return _in_jansky(SkyModel.from_file(str(path)))
     except IndexError as error:
         # pyradiosky looks at the first source also where there is none.
@@ -435,3 +472,15 @@ def _read(settings: section.FileSources) -> SkyModel:
         ) from error
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"sky.foregrounds.path: {path} cannot be read as a catalogue ({error})") from error
+
+
+def _require_known_units(path: Path) -> None:
+    """Raise ValueError if the header of a text file has units that pyradiosky reads over: it takes Jy and Hz."""
+    if path.suffix != ".txt":
+        return
+    with path.open(encoding="utf-8") as stream:
+        header = stream.readline()
+    for name, unit in re.findall(r"(\S+)\s*\[([^\]]*)\]", header):
+        wanted = "Jy" if "flux" in name.lower() else "Hz" if "frequency" in name.lower() else unit
+        if unit != wanted:
+            raise ValueError(f"{name} is in {unit}, and must be in {wanted}")

@@ -41,6 +41,7 @@ from calstudy.run.store import Product, Store, require_writable
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import folder_of_runs, log_to, write
 from calstudy.studies.kinds.comparison import Comparison, WorldData, load_worlds
+from calstudy.studies.preflight import require_possible
 from calstudy.studies.study import make
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ def export(
     subfolders ``world-1`` and so on. Raises InputError as `folders_of` does, or if the data cannot be made.
     """
     folders = folders_of(worlds, folder, file_format, overwrite)
+    require_worlds(worlds)
     fits = [fit(case.experiment, budget, lambda wanted: WorldData.of(wanted).tasks) for case in worlds.cases]
     contents = [WorldData.of(experiment, worlds.file.salt) for experiment, _ in fits]
     runs = folder_of_runs(worlds.outputs)
@@ -79,6 +81,12 @@ def export(
             place.mkdir(parents=True, exist_ok=True)
             _write_world(content, products, place, file_format)
     return folders
+
+
+def require_worlds(worlds: Comparison) -> None:
+    """Raise InputError unless the data of all worlds can be made, as a run of them requires."""
+    for case in worlds.cases:
+        require_possible(case.experiment)
 
 
 def folders_of(worlds: Comparison, folder: Path, file_format: str, overwrite: bool) -> list[Path]:

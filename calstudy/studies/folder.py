@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -89,8 +89,10 @@ def log_to(path: Path) -> Iterator[None]:
 def _remove_leftovers(folder: Path) -> None:
     """Remove partial files of a killed run, except those of the last minute, which may belong to another run."""
     for path in folder.rglob(".*"):
-        if LEFTOVER.fullmatch(path.name) and time.time() - path.stat().st_mtime > 60:
-            path.unlink(missing_ok=True)
+        # Another run of the same study may have given it its name meanwhile.
+        with suppress(FileNotFoundError):
+            if LEFTOVER.fullmatch(path.name) and time.time() - path.stat().st_mtime > 60:
+                path.unlink()
 
 
 def write(path: Path, text: str) -> None:

@@ -70,9 +70,9 @@ def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
 
 def _require_catalogue(experiment: Experiment) -> None:
     """Raise InputError if a file of sources, of the data or assumed, cannot be used for the channels."""
-    channels = experiment.instrument.channels
-    if isinstance(experiment.sky.foregrounds, FileSources):
-        _kept(experiment.sky.foregrounds, channels)
+    channels, foregrounds = experiment.instrument.channels, experiment.sky.foregrounds
+    if isinstance(foregrounds, FileSources) or (isinstance(foregrounds, GleamSources) and foregrounds.path is not None):
+        _kept(foregrounds, channels)
     if isinstance(other := assumed_world(experiment).sky.foregrounds, FileSources):
         try:
             _kept(other, channels)

@@ -55,6 +55,8 @@ class _Band(Section):
     bias_error: Positive
     recovered: Measured = None
     recovered_error: Positive = None
+    cross_transfer: Measured = None
+    linear_transfer: Measured = None
 
     @field_validator("k")
     @classmethod

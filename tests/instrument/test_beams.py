@@ -8,7 +8,7 @@ import h5py
 import healpy
 import numpy as np
 import pytest
-from pyuvdata import BeamInterface, UVBeam
+from pyuvdata import BeamInterface, UVBeam, analytic_beam
 from pyuvdata.analytic_beam import ShortDipoleBeam
 from scipy.constants import speed_of_light
 from scipy.integrate import quad
@@ -439,6 +439,21 @@ def test_a_beam_whose_feed_x_is_north_south_is_refused(tmp_path):
     turned.write_beamfits(tmp_path / "north.beamfits")
     with pytest.raises(InputError, match=r"feed x of .* is not east-west"):
         make_beam(FileBeam(kind="beamfits", path=tmp_path / "north.beamfits"))
+
+
+@pytest.mark.parametrize("grid", ["az_za", "healpix"])
+@pytest.mark.parametrize("beam", [analytic_beam.AiryBeam(diameter=8.0), analytic_beam.GaussianBeam(sigma=0.3)])
+def test_fields_without_a_direction_are_refused(tmp_path, beam, grid):
+    """pyuvdata gives both components of these the same value: a vortex at the zenith."""
+    axes = {"axis1_array": AZIMUTHS, "axis2_array": ZENITH_ANGLES[::10]} if grid == "az_za" else {"nside": 16}
+    table = beam.to_uvbeam(freq_array=EVEN, beam_type="efield", pixel_coordinate_system=grid, **axes)
+    path = tmp_path / "beam.beamfits"
+    table.write_beamfits(path)
+    with pytest.raises(InputError, match="has fields without a direction at the zenith"):
+        make_beam(FileBeam(kind="beamfits", path=path, interpolation="linear"))
+    power = beam.to_uvbeam(freq_array=EVEN, beam_type="power", pixel_coordinate_system=grid, **axes)
+    power.write_beamfits(path, clobber=True)
+    assert make_beam(FileBeam(kind="beamfits", path=path, interpolation="linear")).at(EVEN).Nfreqs == 3
 
 
 @pytest.mark.parametrize(("model", "frequency", "pixels"), [("fagnoni", 160e6, "healpix"), ("nic-cst", 130e6, "az_za")])

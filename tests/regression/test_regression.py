@@ -5,6 +5,7 @@ import io
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.files import sha256
 from calstudy.cli.main import app
 from calstudy.experiment.files import override
+from calstudy.figures.gain_tolerance import GainTolerance
 from calstudy.regression import (
     Regression,
     accept,
@@ -30,6 +32,7 @@ from calstudy.regression import (
     rules_of,
     show,
 )
+from calstudy.report.page import read_charts
 from calstudy.results.reader import RunFolder
 from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
@@ -305,6 +308,59 @@ def test_a_run_never_replaces_the_references_of_other_studies(tmp_path, finished
     assert {path: path.read_bytes() for path in (tmp_path / "all").rglob("*") if path.is_file()} == before
     # Another study may be compared.
     assert command.invoke(app, ["regress", str(other), "--against", str(finished)]).exit_code == 0
+
+
+SWEEP = """
+name: sweep
+outputs: {figures: []}
+sweep: [{sky.eor.seed: [2, 12]}]
+"""
+
+
+def test_references_that_cannot_be_made_again_do_not_stop_the_others(
+    tmp_path, finished, reference, places, monkeypatch
+):
+    """`regress` without a folder goes through all published studies, for hours."""
+    folder = tmp_path / "figures"
+    for name in ("tiny", "zz-last"):
+        shutil.copytree(reference, folder / name)
+    for name, text in (("broken", "name: broken\ninstrument: 3\n"), ("sweep", SWEEP)):
+        (folder / name).mkdir()
+        (folder / name / "experiment.yaml").write_text(text)
+    monkeypatch.setattr("calstudy.regression.run_study", lambda *study: SimpleNamespace(folder=finished))
+    arguments = [word for place in places for word in ("--set", place)]
+    found = CliRunner().invoke(app, ["regress", str(folder), *arguments])
+    assert found.exit_code == 1, found.output
+    told = found.output
+    assert "broken: NOT MADE AGAIN" in told
+    assert "sweep: left out" in told
+    assert told.count(": holds") == 2, told
+
+
+@pytest.mark.parametrize(
+    ("bias", "status"),
+    [([8.26e5, 768.0, 0.5], "beyond"), ([8.26e5, 768.0, 2e-4], "moved"), ([8.26e5, 900.0, 1e-4], "beyond")],
+)
+def test_bands_of_a_law_that_decades_lie_between_are_compared_each(bias, status):
+    """What is a rounding of the first band is half of the EoR in the last."""
+    arrays = {"world.law.bias": np.array([8.26e5, 768.0, 1e-4]), "world.law.sigma": np.array(0.05)}
+    arrays["world.law.terms"] = np.array([[3e8, 3e5, 0.04], [1e9, 1e6, 0.1]])
+    made = {**arrays, "world.law.bias": np.array(bias)}
+    found = compare_figures(
+        {"gain-tolerance": arrays}, {"gain-tolerance": made}, {"gain-tolerance": GainTolerance.tolerances}
+    )
+    assert {item.name: item.status for item in found}["world.law.bias"] == status
+
+
+def test_damaged_arrays_of_a_run_are_one_sentence(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    path = next((run / "figures").glob("*.npz"))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="the arrays of the figure cannot be read"):
+        read_run(run)
+    with pytest.raises(InputError, match="the arrays of the figure cannot be read"):
+        read_charts(path)
 
 
 @pytest.mark.parametrize("option", [["--set", "sky.eor.seed=3"], ["--workers", "2"], ["--max-memory", "4 GB"]])

@@ -23,7 +23,7 @@ from tiny import tiny
 from calstudy.base.errors import InputError
 from calstudy.run import store as store_module
 from calstudy.run.execution import Workers, WorkOrder, execute, perform, schedule
-from calstudy.run.store import Store, leftovers, products
+from calstudy.run.store import Lease, Store, leftovers, products
 from calstudy.run.task import Task
 from calstudy.studies import study
 from calstudy.studies.folder import LOG, log_to, open_folder
@@ -151,6 +151,19 @@ def test_what_killed_runs_left_is_listed_and_deleted_and_no_product(store, capsy
     assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
     assert leftovers(store) == []
     assert [product.path for product in products(store)] == [whole.path]
+
+
+def test_what_a_run_is_filling_is_not_deleted_as_left_over(store, capsys, monkeypatch):
+    """A product may be written at its end only: an old folder is no proof of a killed run."""
+    with Lease(store).holding([KEY]), store.building("number", KEY) as folder:
+        later = time.time() + 7200
+        monkeypatch.setattr("calstudy.run.store.time.time", lambda: later)
+        assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
+        assert folder.is_dir()
+    # Nor is one that is smaller than asked for.
+    (store.root / "number" / f".building-{KEY}-ab").mkdir()
+    assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h", "--larger-than", "1MB") == (0, "")
+    assert [item.key for item in leftovers(store)] == [KEY]
 
 
 def test_leftovers_of_publishing_are_removed_from_run_folders(tmp_path):

@@ -6,9 +6,9 @@ import pytest
 from rich.console import Console
 
 from calstudy.run import provenance
-from calstudy.run.execution import Workers
+from calstudy.run.execution import Workers, execute, schedule
 from calstudy.run.source import Source
-from calstudy.run.store import Store
+from calstudy.run.store import RECORD, Store, products
 from calstudy.run.task import Input, Task
 from calstudy.studies.study import make
 
@@ -78,6 +78,18 @@ def test_a_strict_run_makes_them_again_and_nothing_else(store, capsys, monkeypat
     other_source(monkeypatch, First)
     assert run(store, capsys, strict=True)[0] == {"data", "result", "other"}
     assert run(store, capsys, strict=True)[0] == set()
+
+
+def test_what_another_strict_run_has_made_meanwhile_is_not_made_twice(store, capsys, monkeypatch):
+    """Others may be reading it. Both runs have planned before either has made anything."""
+    run(store, capsys)
+    other_source(monkeypatch, First)
+    planned = schedule(TARGETS, store, strict=True)
+    run(store, capsys, strict=True)
+    records = {product.path: (product.path / RECORD).stat().st_mtime_ns for product in products(store)}
+    made = execute(planned.todo, store, Workers(1, store.root.parent / "run.log"), again=planned.again)
+    assert {product.path for product in made.values()} <= set(records)
+    assert {path: (path / RECORD).stat().st_mtime_ns for path in records} == records
 
 
 def test_a_strict_run_makes_a_store_that_is_not_there(store, capsys):

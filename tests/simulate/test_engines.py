@@ -25,7 +25,7 @@ from simulation_cases import (
 )
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import baseline_vectors
+from calstudy.base.visibilities import baseline_vectors, subset_template
 from calstudy.instrument.beams import ExactBeam
 from calstudy.simulate.engines.dense import DenseEngine, FastestEngine
 from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
@@ -91,6 +91,35 @@ def test_channel_by_channel_healpix_sky_in_kelvin(engine, tile_beam):
     expected = PyuvsimEngine().simulate(sky, tile_beam, template)
     limits = {"dense": 1e-12, "matvis": 1e-11, "fftvis": 1e-10}
     assert relative_error(engine.simulate(sky, tile_beam, template), expected) < limits[engine.label]
+
+
+@pytest.mark.parametrize("engine", [DenseEngine(), PyuvsimEngine()], ids=lambda engine: engine.label)
+def test_a_sky_by_channel_has_its_channels_in_every_part_of_the_band(engine, tile_beam):
+    """A simulation in pieces gives an engine a part of the channels, and the whole sky."""
+    whole = observe(channels=3, times=1)
+    sky = random_sky(whole, count=20)
+    sky.at_frequencies(whole.freq_array * units.Hz)
+    expected = engine.simulate(sky, tile_beam, whole)
+    for channel in range(3):
+        part = subset_template(whole, np.unique(whole.time_array), whole.freq_array[channel : channel + 1])
+        found = engine.simulate(sky, tile_beam, part)
+        assert relative_error(found[:, :, 0], expected[:, :, channel]) < 1e-12
+
+
+@pytest.mark.parametrize("engine", ALL_ENGINES)
+def test_antenna_numbers_in_any_order_are_the_antennas_of_their_positions(engine, gaussian_beam):
+    """One source: the phase is that of the positions of the two antennas."""
+    template = observe(channels=1, times=1, polarizations=("xx",))
+    numbers = np.array([7, 3, 5, 1, 9])
+    before = template.telescope.antenna_numbers
+    renumbered = template.copy()
+    renumbered.telescope.antenna_numbers = numbers
+    places = np.searchsorted(before, [renumbered.ant_1_array, renumbered.ant_2_array])
+    renumbered.ant_1_array, renumbered.ant_2_array = numbers[places]
+    renumbered.baseline_array = renumbered.antnums_to_baseline(renumbered.ant_1_array, renumbered.ant_2_array)
+    sky = point_sky(local_coordinates(template, np.array([1.2]), np.array([0.5])), [3.0])
+    expected, found = (engine.simulate(sky, gaussian_beam, uvd) for uvd in (template, renumbered))
+    assert relative_error(found, expected) < 1e-9
 
 
 def test_polarizations_keep_their_place(sky, tile_beam):

@@ -172,6 +172,41 @@ def test_catalogue_at_other_frequencies_is_refused(tmp_path):
         make_foregrounds(section.FileSources(kind="file", path=path, spectrum="catalogue"), FREQUENCIES)
 
 
+TEXT_HEADER = "SOURCE_ID\tRA_ICRS [deg]\tDec_ICRS [deg]\t{0}\t{1}\n"
+
+
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        (("Flux_76_MHz [Jy]", "Flux_107_MHz [Jy]"), "has fluxes at 76, 107 MHz, and at none of"),
+        (("Flux_76_MHz [Jy]", "Flux_181_MHz [Jy]"), None),
+        (("Flux [mJy]", "Frequency [Hz]"), r"Flux is in mJy, and must be in Jy"),
+        (("Flux [Jy]", "Frequency [MHz]"), r"Frequency is in MHz, and must be in Hz"),
+    ],
+)
+def test_text_catalogues_are_not_extrapolated_and_have_the_units_that_they_name(tmp_path, columns, told):
+    path = tmp_path / "mine.txt"
+    path.write_text(TEXT_HEADER.format(*columns) + "a\t10.0\t-30.0\t20.0\t15.0\n")
+    settings = section.FileSources(kind="file", path=path)
+    if told is None:
+        assert flux(make_foregrounds(settings, FREQUENCIES).sky) == pytest.approx([15.0])
+        return
+    with pytest.raises(InputError, match=told):
+        make_foregrounds(settings, FREQUENCIES)
+
+
+def test_errors_of_sources_of_a_file_do_not_depend_on_the_fainter_ones(tmp_path):
+    path = tmp_path / "sky.skyh5"
+    point_sky({"spectral_type": "flat"}).select(component_inds=[2, 1, 0], inplace=False).write_skyh5(path)
+    errors = section.CatalogueErrors(flux_scatter="5 %")
+    found = [
+        make_foregrounds(section.FileSources(kind="file", path=path, flux_limit=limit, errors=errors), FREQUENCIES).sky
+        for limit in ("1 mJy", "0.1 Jy")
+    ]
+    np.testing.assert_array_equal(found[0].name, ["a", "b", "c"])
+    np.testing.assert_array_equal(flux(found[0])[:2], flux(found[1]))
+
+
 def sub_bands(centres, spectrum):
     """Two points whose fluxes in sub-bands are a polynomial of the frequency in units of 100 MHz, and half of it."""
     stokes = np.zeros((4, len(centres), 2))
@@ -297,6 +332,39 @@ def test_skies_of_own_code_that_cannot_be_used_are_refused(tmp_path):
         make_foregrounds(own_sky(tmp_path, kind="subband", unit="Jy"), np.array([150e6, 190e6]))
 
 
+def test_a_sky_of_own_code_is_the_same_at_every_call(tmp_path):
+    """Each piece of a simulation calls it: the data would be a patchwork of several skies."""
+    drawn = OWN_SKY.replace("[2.0, 1.0]", "np.random.default_rng().uniform(1, 2, 2)")
+    settings = own_sky(tmp_path, kind="flat", unit="Jy")
+    settings.path.write_text(drawn)
+    with pytest.raises(InputError, match="returns another sky at every call"):
+        make_foregrounds(settings, FREQUENCIES)
+    settings.path.write_text(drawn.replace("rng()", "rng(3)"))
+    assert (flux(make_foregrounds(settings, FREQUENCIES).sky) > 1).all()
+
+
+def test_fluxes_of_own_code_are_in_jansky(tmp_path):
+    sky = make_foregrounds(own_sky(tmp_path, kind="flat", unit="mJy"), FREQUENCIES).sky
+    np.testing.assert_allclose(sky.stokes[0, 0].value, [2e-3, 1e-3])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [({"RAJ2000": ["01:02:03"] * 6}, "has text where"), ({"DEJ2000": np.linspace(-80, 100, 6)}, "beyond 90 deg")],
+)
+def test_gleam_files_of_other_content_are_refused(tmp_path, change, told):
+    path = write_gleam(tmp_path / "gleam.vot", **change)
+    with pytest.raises(InputError, match=told):
+        make_foregrounds(section.GleamSources(kind="gleam", path=path), FREQUENCIES)
+
+
+@pytest.mark.parametrize("name", ["gleam.dat", "gleam.fits"])
+def test_gleam_files_of_no_known_format_are_refused(tmp_path, name):
+    (tmp_path / name).write_text("not a table")
+    with pytest.raises(InputError, match=f"{name} cannot be read as a VOTable or FITS table"):
+        make_foregrounds(section.GleamSources(kind="gleam", path=tmp_path / name), FREQUENCIES)
+
+
 COLUMNS = {"table": "", "id": "GLEAM", "right_ascension": "RAJ2000", "declination": "DEJ2000", "flux": "Fintwide"}
 
 
@@ -326,6 +394,14 @@ def votable_of_two(path, rows):
     return section.FileSources.model_validate({"kind": "file", "path": path, "votable": columns})
 
 
+def test_a_votable_without_a_unit_of_the_flux_is_refused(tmp_path):
+    settings = votable_of_two(tmp_path / "mine.vot", 2)
+    text = settings.path.read_text()
+    settings.path.write_text(text.replace(' unit="Jy"', ""))
+    with pytest.raises(InputError, match=r"a column of votable\.flux has no unit"):
+        make_foregrounds(settings, FREQUENCIES)
+
+
 def test_any_votable_is_read_by_the_columns_named(tmp_path):
     sky = make_foregrounds(votable_of_two(tmp_path / "mine.vot", 2), FREQUENCIES).sky
     assert flux(sky) == pytest.approx([2.0, 1.0])
@@ -339,13 +415,13 @@ def test_a_csv_is_read_by_the_columns_named(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("# by hand\ndec,s,ra,alpha\n-30.0,1.5,10.0,-1.0\n-20.0,3.0,20.0,0.5\n-10.0,,30.0,0.0\n")
     flat = make_foregrounds(section.FileSources(kind="file", path=path, csv=CSV), FREQUENCIES)
-    assert flux(flat.sky) == pytest.approx([1.5, 3.0])
-    assert flat.sky.skycoord.icrs.dec.deg == pytest.approx([-30.0, -20.0])
+    assert flux(flat.sky) == pytest.approx([3.0, 1.5])
+    assert flat.sky.skycoord.icrs.dec.deg == pytest.approx([-20.0, -30.0])
     assert flat.stand_in == "foregrounds: 2 sources of mine.csv"
     steep = {"kind": "file", "path": path, "csv": {**CSV, "spectral_index": "alpha"}, "spectrum": "catalogue"}
     sky = make_foregrounds(section.FileSources.model_validate(steep), FREQUENCIES).sky
     at_300 = sky.at_frequencies(np.array([300e6]) * units.Hz, inplace=False)
-    assert flux(at_300) == pytest.approx([0.75, 3 * np.sqrt(2)])
+    assert flux(at_300) == pytest.approx([3 * np.sqrt(2), 0.75])
     path.write_text("dec,s,ra,alpha\n-30.0,1.5,10.0,-1.0\n-20.0,3.0,20.0,\n")
     for spectrum in ("flat", "catalogue"):
         with pytest.raises(

@@ -217,3 +217,14 @@ def test_data_are_not_made_where_the_log_cannot_be_written(tmp_path, monkeypatch
     status, written = run_and_read(capsys, "export", "plain.yaml", "--output", "x", "--set", "outputs.runs=taken")
     assert (status, written.err.count("\n")) == (2, 1)
     assert "outputs.runs = 'taken': cannot be written" in written.err
+
+
+def test_nothing_is_promised_of_data_that_a_run_would_refuse(tmp_path, capsys):
+    """Coarse maps of a steep EoR have replicas at long baselines; gains of such data could not be scored."""
+    changes = ["--set", "sky.eor.spectrum=power-law", "--set", "sky.eor.nside=16"]
+    secret = ["--output", tmp_path / "data", "--blind", tmp_path / "secret.yaml"]
+    status, written = run_and_read(capsys, "export", "quickstart", *changes, *secret)
+    assert status == 2
+    assert "sky.eor.nside = 16: maps of a power-law spectrum" in written.err
+    assert "SHA-256" not in written.out
+    assert not any(tmp_path.iterdir())

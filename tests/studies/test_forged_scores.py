@@ -23,7 +23,7 @@ from calstudy.instrument.telescope import make_template
 from calstudy.realdata.reading import read_metadata, read_visibilities
 from calstudy.sky.foregrounds import make_foregrounds
 from calstudy.sky.settings import FileSources
-from calstudy.studies.scores import Scores, leaderboard, tables
+from calstudy.studies.scores import Row, Scores, leaderboard, tables
 
 NAMES = [
     "../gains",
@@ -303,3 +303,14 @@ def test_a_refusal_counts_in_a_world_without_rows():
     found = tables(Scores(calstudy="0", name="c", rows=rows, refusals=(("hard", "mine", "no redundant baselines"),)))
     assert list(found) == ["easy", "Which calibrator to trust"]
     assert found["Which calibrator to trust"].rows[0][1:] == 2 * ("fails in hard (cannot work)",)
+
+
+def test_scores_of_files_have_the_linear_response_of_a_comparison():
+    """T at the end of a fit depends on its path, and the smaller one counts."""
+    made = row("world", "mine", [0.0, 0.0], 0.01, [0.5, 0.9])
+    for linear, verdict in ((None, "passes"), (0.0, "fails")):
+        known = {"linear_transfer": linear, "transfer_error": 0.02}
+        scores = {**made.scores, "bands": [{**band, **known} for band in made.scores["bands"]]}
+        rows = Row(**{**made.model_dump(), "scores": scores})
+        found = tables(Scores(calstudy="0", name="mine", rows=(rows,)))["Which calibrator to trust"]
+        assert verdict in str(found.rows[0][1]), found.rows

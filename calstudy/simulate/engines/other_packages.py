@@ -264,8 +264,9 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
     from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
 
     use_bundled_earth_orientation()
-    listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
     by_antenna = dict(zip(template.telescope.antenna_names, index.tolist(), strict=True))
+    template = _by_number(template)
+    listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
     tasks = range(template.Nblts * template.Nfreqs)
     cube = np.empty((template.Nblts, template.Nfreqs, len(_products(beams[0]))), dtype=np.complex128)
     engine = UVEngine()
@@ -276,6 +277,18 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
             engine.set_task(task)
             cube[tuple(task.uvdata_index[:2])] = engine.make_visibility()
     return cube
+
+
+def _by_number(template: UVData) -> UVData:
+    """Return metadata with the antennas of the telescope in the order of their numbers, as pyuvsim looks them up."""
+    found = template.copy()
+    telescope = found.telescope
+    order = np.argsort(telescope.antenna_numbers)
+    for parameter in telescope:
+        values = getattr(telescope, parameter)
+        if isinstance(values.form, tuple) and values.form[:1] == ("Nants",) and values.value is not None:
+            setattr(telescope, values.name, np.asarray(values.value)[order])
+    return found
 
 
 def _products(beam: UVBeam | AnalyticBeam) -> list[int]:
@@ -293,6 +306,11 @@ def _catalog(sky: SkyModel, frequencies: np.ndarray) -> SkyModelData:
 
     # These are pyuvsim's steps at the start of a parallel run. They are in place, so a copy is made.
     sky = sky.copy()
+    if sky.spectral_type == "full":
+        # pyuvsim takes the rows of such a sky for the channels of the template, which may be a few of them.
+        tabulated = sky.freq_array.to_value("Hz")
+        nearest = [int(np.abs(tabulated - frequency).argmin()) for frequency in frequencies]
+        sky.at_frequencies(sky.freq_array[nearest])
     without_frequency = sky.spectral_type == "flat" and sky.reference_frequency is None and sky.freq_array is None
     if sky.spectral_type not in ("flat", "full") or (sky.component_type == "healpix" and without_frequency):
         sky.at_frequencies(frequencies * units.Hz, freq_interp_kind=interpolation_of(sky))
