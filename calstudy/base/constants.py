@@ -7,6 +7,8 @@ SPEED_OF_LIGHT = 299_792_458.0
 BOLTZMANN = 1.380649e-23
 """Boltzmann constant, J/K."""
 SECONDS_PER_DAY = 86400.0
+SIDEREAL_DAY = 0.99726956633
+"""Days after which the stars are at the same place."""
 SAME_LENGTH = 1e-3
 """Lengths on the ground that differ by at most this, m, are the same but for rounding."""
 SIGMAS_95 = 1.96

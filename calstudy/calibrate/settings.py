@@ -344,7 +344,12 @@ class GainFit(WeightedFit):
     solver: Solver = GaussNewtonSettings()
     # A redundant start has the phase gradients of the sky model since 2.
     initial_gains: InitialGains = Field(UnityStart(), json_schema_extra={REVISED: 2})
-    redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
+    redundancy_tolerance: Length = Field(
+        0.5,
+        gt=0,
+        description="Baselines whose vectors agree within a quarter of this are redundant; those that differ by more "
+        "than half of it are not (a grid of pyuvdata).",
+    )
     gain_delay: Delay | None = Field(
         None,
         gt=0,

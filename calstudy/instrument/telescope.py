@@ -10,7 +10,7 @@ from astropy.coordinates import EarthLocation
 from pyuvdata import Telescope, UVData
 from pyuvdata import utils as uvutils
 
-from calstudy.base.constants import SECONDS_PER_DAY
+from calstudy.base.constants import SECONDS_PER_DAY, SIDEREAL_DAY
 from calstudy.base.visibilities import keep_compiled_pyuvdata, new_observation, use_bundled_earth_orientation
 from calstudy.instrument.as_built import position_offsets
 from calstudy.instrument.layouts import Layout, make_array
@@ -19,7 +19,6 @@ from calstudy.instrument.settings import InstrumentSettings
 # Noon UTC of 2016 November 15; the observation starts within the sidereal day after it, wherever the array is. At the
 # MWA the field of the paper (LST 1.8 h) is then up at night, and the Earth's orientation is known, not predicted.
 REFERENCE_JD = 2457708.0
-SIDEREAL_DAY = 0.99726956633
 POLARIZATION_NUMBERS = {"xx": -5, "yy": -6}
 
 

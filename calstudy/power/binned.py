@@ -65,8 +65,12 @@ def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.
     `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out. `noise`, (Nu,), is P_N of a single product
     of each unit, whose real part has the variance P_N^2 / 2.
     """
+    level = np.max(noise, initial=0.0, where=np.isfinite(noise))
+    if (noise == 0).all():
+        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 0.0, np.nan)
     with np.errstate(divide="ignore"):
-        independent = spectra.n_pairs / (noise**2 / 2)
+        # Units without noise count as of so little that it does not matter.
+        independent = spectra.n_pairs / (np.maximum(noise, 1e-12 * level) ** 2 / 2)
         return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan) / np.sqrt(
             _modes_of_noise(spectra, bins, n_bins, independent)
         )

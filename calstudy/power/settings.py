@@ -54,7 +54,10 @@ class PowerSettings(Section):
         "groups if at least half of the baselines have a redundant partner.",
     )
     redundancy_tolerance: Length = Field(
-        1.0, gt=0, description="Baselines whose vectors differ by less than this are in one group."
+        1.0,
+        gt=0,
+        description="Baselines whose vectors agree within a quarter of this are in one group; those that differ "
+        "by more than half of it are not (a grid of pyuvdata).",
     )
     coherent_time: Time | None = Field(
         None,

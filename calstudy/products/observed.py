@@ -113,7 +113,7 @@ def average(graph: MeasuredGraph, what: str, parity: str, injected: Task | None 
         what=what,
         data=data,
         calibration=calibration_with(graph, data, parity) if injected else calibrated(graph, parity),
-        **graph.parts.averaging(graph.experiment.power),
+        **graph.parts.averaging(graph.experiment.power, parity),
     )
 
 

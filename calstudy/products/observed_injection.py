@@ -102,7 +102,7 @@ def transfer(graph: MeasuredGraph) -> Task | None:
     signals, responses = [], []
     for parity in PARITIES:
         injected = Inject(f"data + eor {parity}", data=observed(graph, parity), **_added(graph, parity))
-        blocks = graph.parts.averaging(graph.experiment.power)
+        blocks = graph.parts.averaging(graph.experiment.power, parity)
         signals.append(AverageEor(f"eor {parity}", **_added(graph, parity), **blocks))
         own, with_signal = (average(graph, "residual", parity, data) for data in (None, injected))
         label = f"response to the eor {parity}"
@@ -355,14 +355,18 @@ class _OfData(Task):
 
 
 class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=3):
-    """The expected T of the middle solve of one half of measured data; equal lengths share a bin since version 3."""
+    """The expected T of the middle solve of one half of measured data, of the first polarization that has solutions.
+
+    Equal lengths share a bin since version 3.
+    """
 
     power: PowerSettings
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the expected T in bins of k and of length and delay."""
         result = read_result(self.calibration)
-        found = self.expect(result, 0, self.power.taper)
+        expected = (self.expect(result, index, self.power.taper) for index in range(result.model.Npols))
+        found = next((one for one in expected if one is not None), None)
         if found is None:
             raise InputError("expected-loss: no solve of the calibration gave gains")
         lengths: np.ndarray = np.linalg.norm(baseline_vectors(result.model), axis=1)

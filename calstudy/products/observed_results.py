@@ -136,7 +136,7 @@ class ObservedSpectra(Task, stage="observed-spectra", version=2, cost=Cost(10, d
         """Return the spherical spectra by their modes, with errors by the noise of each baseline."""
         from calstudy.realdata.noise import noise_of_units
 
-        of_units, found = noise_of_units(spectra, noise, level), {}
+        of_units, found = noise_of_units(spectra, noise, level, self.power.redundancy_tolerance), {}
         for modes, excise in EXCISION.items():
             spectrum = with_errors(spherical_average(spectra, self.power, excise))
             bins = modes_in_bins(spectra, self.power, excise)

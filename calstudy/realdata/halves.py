@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.base.constants import SECONDS_PER_DAY
+from calstudy.base.constants import SECONDS_PER_DAY, SIDEREAL_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.feeds import X_IN_FILE, direction_of_x, rename_feeds
 from calstudy.base.observation import Frame
@@ -103,37 +103,48 @@ class Parts:
         times = self.facts[part].times
         return times[PARITIES.index(part) :: 2] if self.interleaved else times
 
-    def averaging(self, power: PowerSettings) -> dict[str, Any]:
+    def averaging(self, power: PowerSettings, part: str) -> dict[str, Any]:
         """Return the averaging of a half: the phase centre, or the number of blocks, their span and the kept ones.
 
-        The span is that of both halves if they are interleaved; otherwise each half has its own. Blocks that one half
-        lacks, because of gaps, are left out of both. The keys are ``centre``, a Julian date or None; or ``blocks``,
-        ``span`` (two Julian dates or None) and, if some blocks are left out, the numbers of those that are ``kept``.
-        Raise InputError if `coherent_time` gives blocks that the halves cannot have in common.
+        Both halves have the centre and the span of the even one; those of another night are at its sidereal times, so
+        that both are phased to the same point of the sky. Blocks that one half lacks, because of gaps, are left out of
+        both. The keys are ``centre``, a Julian date; or ``blocks``, ``span`` (two Julian dates) and, if some blocks are
+        left out, the numbers of those that are ``kept``. Raise InputError if `coherent_time` gives blocks that the
+        halves cannot have in common.
         """
         # Reading metadata does not need the averaging of data, which takes long to import.
         from calstudy.power.average import divide
 
         even = self.facts["even"]
         count = power.n_blocks(even.duration, even.integration)
+        spans = {name: [date + _later(even, facts) for date in _ends(even)] for name, facts in self.facts.items()}
         if count == 1:
-            # Both halves have the same phase centre at the zenith, or each that of its own middle.
-            return {"centre": float((even.times.min() + even.times.max()) / 2) if self.interleaved else None}
+            return {"centre": sum(spans[part]) / 2}
         if self.interleaved and (power.coherent_time or 0) < 2 * even.integration:
             raise InputError(
                 f"power.coherent_time = {power.coherent_time:g} s: a block must hold two integrations, "
                 f"{2 * even.integration:g} s, of which each half has one"
             )
-        span = [float(even.times.min()), float(even.times.max())] if self.interleaved else None
         found = [
-            {block.number for block in divide(self.times(parity), self.facts[parity].integration, count, span)}
+            {block.number for block in divide(self.times(parity), self.facts[parity].integration, count, spans[parity])}
             for parity in PARITIES
         ]
         common = sorted(found[0] & found[1])
         if not common:
             raise InputError("power.coherent_time: gaps leave no block that both halves have; a longer time may help")
         kept = {} if found[0] == found[1] else {"kept": common}
-        return {"blocks": count, "span": span, **kept}
+        return {"blocks": count, "span": spans[part], **kept}
+
+
+def _ends(facts: Facts) -> tuple[float, float]:
+    return float(facts.times.min()), float(facts.times.max())
+
+
+def _later(even: Facts, other: Facts) -> float:
+    """Return the time in days from a sidereal time of the even half to the same one in another half."""
+    angle = even.sidereal_times[0] - other.sidereal_times[0]
+    apart = np.angle(np.exp(1j * angle)) / (2 * np.pi) * SIDEREAL_DAY
+    return float(other.times[0] + apart - even.times[0])
 
 
 def read_facts(

@@ -147,11 +147,12 @@ def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> 
     return np.divide(total, count, out=np.full(count.size, np.nan), where=count > 0)
 
 
-def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarray) -> np.ndarray:
+def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarray, tolerance: float) -> np.ndarray:
     """Return P_N of each unit of spectra (baseline or redundant group), (Nu,): the mean over its baselines.
 
     `noise` gives the baselines, and `levels` P_N of each. NaN is left out; units without levels have the mean of all.
-    Baselines are identified by their antennas, and those of groups, or of spectra without shares, by their vectors.
+    Baselines are identified by their antennas, and those of groups, or of spectra without shares, by their vectors, to
+    a tolerance in m: baselines without a partner are in no group.
     """
     known = np.isfinite(levels)
     mean = np.mean(levels[known]) if known.any() else np.nan
@@ -162,7 +163,8 @@ def noise_of_units(spectra: DelaySpectra, noise: DelaySpectra, levels: np.ndarra
     both = np.concatenate([spectra.vectors, -spectra.vectors])
     # Units of the same vector, which only spectra without shares have, cannot be told apart: they have one level.
     group = redundant_groups(spectra.vectors, SAME_LENGTH).index
-    place = group[cKDTree(both).query(noise.vectors[known])[1] % len(group)]
-    count = np.bincount(place, minlength=len(group))
-    total = np.bincount(place, levels[known], len(group))
+    distance, nearest = cKDTree(both).query(noise.vectors[known])
+    place, near = group[nearest % len(group)], distance <= tolerance
+    count = np.bincount(place[near], minlength=len(group))
+    total = np.bincount(place[near], levels[known][near], len(group))
     return np.divide(total, count, out=np.full(count.size, mean), where=count > 0)[group]

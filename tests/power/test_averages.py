@@ -15,7 +15,7 @@ from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.power import binned, delay
 from calstudy.power import cosmology as c
-from calstudy.power.binned import cylindrical_average, make_bin_edges, modes_in_bins, spherical_average
+from calstudy.power.binned import cylindrical_average, make_bin_edges, modes_in_bins, noise_error, spherical_average
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import (
@@ -356,7 +356,7 @@ def test_baselines_of_the_same_vector_have_their_own_noise(observe, white, beam,
         places *= np.where(places[:, 0] != 0, np.sign(places[:, 0]), np.sign(places[:, 1]))[:, None]
         same = (places[:, None] == places).all(axis=2)
         expected = np.array([np.nanmean(level[row]) for row in same])[1:]
-    np.testing.assert_allclose(noise_of_units(spectra, noise, level), expected)
+    np.testing.assert_allclose(noise_of_units(spectra, noise, level, 1.0), expected)
 
 
 def test_redundant_groups_have_the_mean_noise_of_their_baselines(observe, white, beam):
@@ -366,10 +366,35 @@ def test_redundant_groups_have_the_mean_noise_of_their_baselines(observe, white,
         delay_spectra(estimate_power(data, data, beam, settings), settings)
         for settings in (PowerSettings(pairs="same-baseline"), PowerSettings(pairs="redundant-group"))
     )
-    # The spacing is 14 m. The baselines of 28 m have no partner.
-    level = np.where(noise.length > 27, np.nan, noise.length**2)
-    found = noise_of_units(groups, noise, level)
-    np.testing.assert_allclose(found, groups.length**2, rtol=1e-3)
+    # The spacing is 14 m. The baselines of 28 m have no partner: their interference is in no group.
+    for alone in (np.nan, 1e6):
+        level = np.where(noise.length > 27, alone, noise.length**2)
+        found = noise_of_units(groups, noise, level, 1.0)
+        np.testing.assert_allclose(found, groups.length**2, rtol=1e-3)
+
+
+def test_without_noise_errors_are_zero(observe, white, beam):
+    template = observe(HexLayout(kind="hex", side=2), n_channels=8)
+    settings = PowerSettings(pairs="same-baseline")
+    data = white(template, np.random.default_rng(4))
+    spectra = delay_spectra(estimate_power(data, data, beam, settings), settings)
+    bins = np.where(np.arange(spectra.power.shape[1]) > 3, 1, -1) * np.ones(spectra.power.shape, int)
+    found = noise_error(spectra, bins, 3, np.zeros(len(spectra.power)))
+    np.testing.assert_array_equal(found, [np.nan, 0.0, np.nan])
+    # One noisy baseline has its part of the mean of all.
+    one, level = noise_error(spectra, bins, 3, np.eye(len(spectra.power))[0]), np.ones(len(spectra.power))
+    assert one[1] == pytest.approx(noise_error(spectra, bins, 3, level)[1] / np.sqrt(len(level)), rel=1e-6)
+
+
+def test_frequencies_that_two_programs_round_are_the_same(observe, white, beam):
+    template, rng = observe(HexLayout(kind="hex", side=2), n_channels=8), np.random.default_rng(4)
+    even, odd = white(template, rng), white(template, rng)
+    odd.freq_array = odd.freq_array + 1.0
+    settings = PowerSettings(pairs="same-baseline")
+    assert np.isfinite(delay_spectra(estimate_power(even, odd, beam, settings), settings).power).all()
+    odd.freq_array = even.freq_array + 0.1 * even.channel_width[0]
+    with pytest.raises(ValueError, match="differ in freq_array"):
+        estimate_power(even, odd, beam, settings)
 
 
 def test_noise_of_an_average_is_that_of_the_samples_whose_variance_is_known(observe, white):

@@ -10,6 +10,7 @@ from astropy import units as u
 from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
 
+from calstudy.base.constants import SIDEREAL_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.instrument.array_layouts.geometric import GolombLayout
@@ -173,16 +174,33 @@ def test_from_cube_of_blocks_keeps_their_order(hour, rng):
     assert (np.diff(averaged.time_array.reshape(6, -1)[:, 0]) > 0).all()
 
 
-def averaging(times, coherent_time, odd=None):
+def averaging(times, coherent_time, odd=None, part="even"):
     """How halves are averaged, interleaved or two data sets, of integrations of 10 s with these numbers."""
 
     def facts(found):
         found = np.asarray(found) * 10 / DAY + 2459000.0
-        return SimpleNamespace(times=found, integration=10.0, duration=np.ptp(found) * DAY + 10)
+        sidereal = 2 * np.pi * (found - 2459000.0) / SIDEREAL_DAY % (2 * np.pi)
+        return SimpleNamespace(
+            times=found, sidereal_times=sidereal, integration=10.0, duration=np.ptp(found) * DAY + 10
+        )
 
     even = facts(times)
     halves = Parts({"even": even, "odd": even if odd is None else facts(odd)})
-    return halves.averaging(PowerSettings(coherent_time=f"{coherent_time} s"))
+    return halves.averaging(PowerSettings(coherent_time=coherent_time and f"{coherent_time} s"), part)
+
+
+@pytest.mark.parametrize("coherent_time", [None, 60.0])
+@pytest.mark.parametrize("late", [0.0, 0.4, -1.0, 3.7])
+def test_two_nights_are_phased_to_the_same_point_of_the_sky(coherent_time, late):
+    """The other night begins and ends at other sidereal times; its integrations are as long after the even ones."""
+    nights = 3 * SIDEREAL_DAY
+    odd = np.arange(24) + nights * DAY / 10 + late
+    even, other = (averaging(np.arange(24), coherent_time, odd, part) for part in ("even", "odd"))
+    name = "centre" if coherent_time is None else "span"
+    # A millisecond is 0.015 arcsec.
+    np.testing.assert_allclose(np.array(other[name]) - np.array(even[name]), nights, atol=1e-3 / DAY)
+    same = averaging(np.arange(24), coherent_time, None, "odd")
+    assert same[name] == even[name]
 
 
 def test_halves_of_measured_data_have_the_blocks_that_both_have():

@@ -58,7 +58,12 @@ class Redcal(OtherPackage):
     # from its gains since 3; passes that swing go half of the way since 4.
     version: ClassVar[int] = 4
     calibrator: str = "redcal"
-    redundancy_tolerance: Length = Field(0.5, gt=0, description="Baselines closer than this are redundant.")
+    redundancy_tolerance: Length = Field(
+        0.5,
+        gt=0,
+        description="Baselines whose vectors agree within a quarter of this are redundant; those that differ by more "
+        "than half of it are not (a grid of pyuvdata).",
+    )
     steps: Annotated[tuple[Step, ...], Field(strict=False, min_length=1)] = Field(
         STEPS,
         description="What is done: a delay and a phase per antenna; a linear fit of logarithms; a fit of the "
