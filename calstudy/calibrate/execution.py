@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
@@ -69,6 +70,29 @@ def smooth(
         for a, p in np.argwhere(~flags.all(axis=(1, 2))):
             smoothed[a, :, :, p] = fit(values[a, :, :, p], ~flags[a, :, :, p], in_frequency, in_time)
     return np.where(flags, gains, smoothed)
+
+
+def smoothly_turned(gains: np.ndarray) -> np.ndarray:
+    """Turn the phase of each channel, which no data determine, so that it does not jump; zeros are unknown.
+
+    Gains, (Nants, Nfreqs, Ntimes, Npols), agree best with those of the next channel, and of the next integration. A
+    real sum over antennas, in contrast, has jumps where cable delays make it small, and smoothing would leave these to
+    single antennas.
+    """
+    turned = gains.copy()
+    for t, p in np.ndindex(gains.shape[2:]):
+        for k in range(1, gains.shape[1]):
+            turned[:, k, t, p] *= _agreeing(turned[:, k, t, p], (turned[:, e, t, p] for e in reversed(range(k))))
+        turned[..., t, p] *= _agreeing(turned[..., t, p], (turned[..., e, p] for e in reversed(range(t))))
+    return turned
+
+
+def _agreeing(gains: np.ndarray, others: Iterable[np.ndarray]) -> complex:
+    """Return the phase factor that turns gains to the first of others that have known ones of the same antennas."""
+    for other in others:
+        if common := np.vdot(gains, other):
+            return complex(common / abs(common))
+    return 1.0
 
 
 def _fault(sentence: str) -> InputError:
@@ -373,8 +397,11 @@ class _Returned:
                 flags[self.groups[group], :, :, p] = True
         self.gain_flags |= ~self.fitted.antennas_of(np.moveaxis(~flags, 0, 2))
         gains = np.where(self.gain_flags, 1, self.gains)
-        if self.calibrator.smooth_gains is not None:
-            gains = smooth(gains, self.gain_flags, self.fitted, self.numbers, self.calibrator.smooth_gains)
+        smoothing = self.calibrator.smooth_gains
+        if smoothing is not None:
+            if smoothing.reference_antenna is None:
+                gains = np.where(self.gain_flags, 1, smoothly_turned(np.where(self.gain_flags, 0, gains)))
+            gains = smooth(gains, self.gain_flags, self.fitted, self.numbers, smoothing)
         residual = self._residual(gains, flags)
         template = self.fitted.uvd
         model = self.model if self.closure is None else self.closure * self.model

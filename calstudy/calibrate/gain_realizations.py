@@ -1,7 +1,8 @@
 """Errors of the gains of any calibrator, from fits to realizations of the noise.
 
 The fitted visibilities g_a g_b* F take the part of the truth. To these noise is added, with the variance of the
-residual, one for all baselines and channels, and they are calibrated again. The gains scatter by their errors.
+residual, one for all baselines and channels of a solve and the inverse of the number of measurements of a sample, and
+they are calibrated again. The gains scatter by their errors.
 
 A fit takes some noise out of the data, most of it on baselines with strong foregrounds. The residual has less than
 there is, and the same realizations, in which the noise is known, tell how much: they leave a fraction l of its power,
@@ -52,20 +53,27 @@ class GainRealizations:
         One phase in every channel of an integration, which no data determine, has no part in them.
         """
         gains, used = self.result.gains.gain_array, ~self.result.gains.flag_array
-        residual = self._as_measured(self.result)
         known = ~flag_cube(self.result.residual)
-        power = np.sum(np.abs(residual) ** 2, axis=(0, 1, 2), where=known)
-        # Of each polarization.
-        sigma = np.sqrt(power / np.maximum(known.sum(axis=(0, 1, 2)), 1))
+        sigma = self._noise(known)
         left, changes = 0.0, []
         for drawn in self._drawn(sigma):
             found = run_calibrator(self.calibrator, drawn, self.sky, noise=self.noise)
             of_both = known & ~flag_cube(found.residual)
-            expected = np.sum(np.broadcast_to(sigma**2, known.shape), where=of_both)
-            left += np.sum(np.abs(self._as_measured(found)) ** 2, where=of_both) / expected / self.count
+            ratio = np.divide(np.abs(self._as_measured(found)), sigma, out=np.zeros(sigma.shape), where=sigma > 0)
+            left += np.mean(ratio**2, where=of_both & (sigma > 0)) / self.count
             changes.append(_logarithm(found.gains.gain_array, gains, used & ~found.gains.flag_array))
         scatter = [np.std(part, axis=0, ddof=1) / np.sqrt(left) for part in (np.real(changes), np.imag(changes))]
         return np.stack([np.abs(gains) * scatter[0], scatter[1]])
+
+    def _noise(self, known: np.ndarray) -> np.ndarray:
+        """Return sigma of the noise of every sample that the residual tells, (Ntimes, Nbls, Nfreqs, Npols)."""
+        counts = self.result.residual.nsample_array.reshape(known.shape)
+        counts = np.where(counts > 0, counts, 1)
+        power, sigma = counts * np.abs(self._as_measured(self.result)) ** 2, np.zeros(known.shape)
+        for times in self.calibrator.solves(len(known)):
+            number = np.maximum(known[times].sum(axis=(0, 1, 2)), 1)
+            sigma[times] = np.sqrt(np.sum(power[times], axis=(0, 1, 2), where=known[times]) / number / counts[times])
+        return sigma
 
     def _as_measured(self, result: CalibrationResult) -> np.ndarray:
         """Return V - g_a g_b* F, (Ntimes, Nbls, Nfreqs, Npols), zero where flagged."""

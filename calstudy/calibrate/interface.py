@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import Plugin, Registry
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.schema import Section, choice, fault
+from calstudy.base.schema import REVISED, Section, choice, fault
 from calstudy.base.units import Frequency, Time
 from calstudy.calibrate.records import Solve
 from calstudy.instrument.settings import Size
@@ -106,8 +106,8 @@ class Smoothing(Section):
     reference_antenna: int | None = Field(
         None,
         ge=0,
-        description="Number of the antenna whose phase is made zero in every channel before; null: phases are smoothed "
-        "as the calibrator leaves them.",
+        description="Number of the antenna whose phase is made zero in every channel before; null: the phase of each "
+        "channel, which no data determine, is turned so that neighbouring channels and integrations agree.",
     )
     axes: ClassVar[tuple[str, str]] = ("frequency_scale", "time_scale")
     """The fields of which one at least is given."""
@@ -169,7 +169,11 @@ class Calibrator(Plugin):
 
     calibrator: str = Field("", description="Its name, or the path of a Python file that defines it.")
     integrations_per_solve: int = Field(
-        1, ge=1, description="Consecutive integrations that are solved together and share their gains."
+        1,
+        ge=1,
+        description="Consecutive integrations that are solved together and share their gains.",
+        # Their weights have one mean together, and not each the same, since 2.
+        json_schema_extra={REVISED: 2},
     )
     chunks: int = Field(
         4,
@@ -185,7 +189,10 @@ class Calibrator(Plugin):
         "sky model is the true foregrounds.",
     )
     smooth_gains: SmoothGains | None = Field(
-        None, description="Smooth the gains once they are found, and calibrate with those; the model stays as it is."
+        None,
+        description="Smooth the gains once they are found, and calibrate with those; the model stays as it is.",
+        # Without a reference antenna, phases of channels do not jump before they are smoothed since 2.
+        json_schema_extra={REVISED: 2},
     )
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:

@@ -83,7 +83,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     """
     require_parallel_hands(observation.uvd)
     fitted = fitted_baselines(observation, settings.autos)
-    weights = make_weights(observation, fitted, settings.weights)
+    weights = make_weights(observation, fitted, settings.weights, settings.solves(observation.n_times))
     if isinstance(settings, ForegroundFit) and settings.foreground_prior.finite:
         weights = inverse_variances(observation, fitted, weights, settings, assumed.noise)
     data, used = observation.baselines(fitted), weights > 0

@@ -306,6 +306,17 @@ class ForegroundPrior(Section):
         return any(value not in (0, "infinite") for value in (self.deviation, self.shared_deviation))
 
 
+def _unconnected_parts(antennas: np.ndarray) -> int:
+    """Return into how many parts without a baseline between them baselines, (Nbls, 2), connect their antennas."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    present, places = np.unique(antennas, return_inverse=True)
+    first, second = places.reshape(-1, 2).T
+    graph = coo_array((np.ones(first.size), (first, second)), shape=(present.size, present.size))
+    return int(connected_components(graph, directed=False)[0])
+
+
 class WeightedFit(Calibrator):
     """Settings that all calibrators have in common that fit gains to weighted visibilities."""
 
@@ -332,7 +343,13 @@ class WeightedFit(Calibrator):
                 f"baselines: none lies within the range; the data have {frame.lengths.min():.0f} to "
                 f"{frame.lengths.max():.0f} m"
             )
-        return frame.baselines(chosen)
+        found = frame.baselines(chosen)
+        if (parts := _unconnected_parts(found.antennas[~found.autos])) > 1:
+            raise InputError(
+                f"baselines: those within the range leave {parts} parts of the array unconnected, whose phases against "
+                "each other would not be known; give a wider range"
+            )
+        return found
 
 
 class GainFit(WeightedFit):
@@ -374,7 +391,7 @@ class GainFit(WeightedFit):
         preset = cls.model_fields["solver"].default
         if given == preset.name:
             given = {"name": given}
-        if not isinstance(given, dict) or given.get("name") != preset.name:
+        if not isinstance(given, dict) or given.get("name", preset.name) != preset.name:
             return data
         return {**data, "solver": {**preset.model_dump(), **given}}
 

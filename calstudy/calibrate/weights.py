@@ -8,6 +8,7 @@ delays.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +29,13 @@ FEW = 0.05
 """With data in a smaller fraction of the channels, a fit of foregrounds and gains is unreliable; this is reported."""
 
 
-def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np.ndarray:
+def make_weights(
+    data: Observation, fitted: np.ndarray, settings: Weights, groups: Sequence[slice] | None = None
+) -> np.ndarray:
     """Return the weight of every sample, zero where flagged or where an antenna was off (`dead_samples`).
 
-    In each integration and polarization their mean over unflagged samples is that of the paper, 1 / (Nbls Nfreqs).
+    In each of the `groups` of integrations that are solved together, by default single ones, and each polarization
+    their mean over unflagged samples is that of the paper, 1 / (Nbls Nfreqs).
     Weights from gains are those of unity gains; the solves change them. They are float64, (Ntimes, Nfitted, Nfreqs,
     Npols), for the baselines of the mask `fitted`, (Nbls,); the data include autocorrelations where weights need them.
 
@@ -48,8 +52,12 @@ def make_weights(data: Observation, fitted: np.ndarray, settings: Weights) -> np
     else:
         weights = used.astype(float)
     size = weights.shape[1] * weights.shape[2]
-    count, total = (np.sum(values, axis=(1, 2), keepdims=True) for values in (weights > 0, weights))
-    return weights * (count / size / np.where(total > 0, total, 1))
+    scaled = np.zeros_like(weights)
+    for times in groups or [slice(t, t + 1) for t in range(len(weights))]:
+        part = weights[times]
+        count, total = (np.sum(values, axis=(0, 1, 2)) for values in (part > 0, part))
+        scaled[times] = part * (count / size / np.where(total > 0, total, 1))
+    return scaled
 
 
 def _counts(data: Observation, fitted: np.ndarray, used: np.ndarray, kind: str) -> np.ndarray:

@@ -154,11 +154,12 @@ class OfSolves(Calibrated):
         return Cost(5 + 1.3e-5 * size.samples, memory, 1e6)
 
 
-class ErrorsOfGains(OfSolves, stage="gain-errors", version=7):
+class ErrorsOfGains(OfSolves, stage="gain-errors", version=8):
     """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged.
 
     Since version 6 fits with a taper have no errors by their matrix. Since version 7 integrations without data, which
-    share gains with others, have no errors and do not count.
+    share gains with others, have no errors and do not count. Since version 8 realizations have the noise of each solve
+    and sample.
 
     If no solve has errors by its own matrix, they come from fits to this many `realizations` of the noise, unless it is
     zero.

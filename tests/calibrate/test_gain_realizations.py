@@ -16,6 +16,7 @@ from calstudy.calibrate.calibrators.redcal import Redcal
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.gain_errors import gain_errors
 from calstudy.calibrate.gain_realizations import GainRealizations
+from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import FlagWeights
 
 REALIZATIONS = 16
@@ -44,6 +45,20 @@ def test_they_are_those_of_the_matrix(noisy):
     ratio = found[..., 0, 0] / np.stack([exact.amplitude, exact.phase])
     # The rms over 500 gains of deviations of 16 numbers scatters by 1 %, and neighbours have noise in common.
     assert np.sqrt(np.mean(ratio**2, axis=(1, 2))) == pytest.approx([1, 1], abs=0.05)
+
+
+def test_errors_go_with_the_number_of_measurements(noisy):
+    """Noise of samples that are averages of a hundred measurements, solved beside single ones."""
+    uvd = make_uvdata(noisy, n_times=2)
+    sky = sky_of(uvd, noisy.foregrounds)
+    products = gain_products(noisy.gains, noisy.antennas) * noisy.foregrounds
+    rows = slice(uvd.Nbls, None)
+    uvd.data_array[rows, :, 0] = products + (uvd.data_array[rows, :, 0] - products) / 10
+    uvd.nsample_array[rows] = 100
+    _, found = by_realizations(Skycal(weights=FlagWeights()), uvd, sky, count=4)
+    single, many = np.nanmedian(found, axis=(1, 2))[..., 0].T
+    # Medians over 500 gains of deviations of four numbers.
+    assert single / many == pytest.approx([10, 10], rel=0.15)
 
 
 @pytest.mark.parametrize(

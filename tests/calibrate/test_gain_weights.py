@@ -20,8 +20,14 @@ from calstudy.calibrate import calamity
 from calstudy.calibrate.basis import dpss_vectors
 from calstudy.calibrate.calamity import make_solver
 from calstudy.calibrate.calibrators import other_packages
-from calstudy.calibrate.calibrators.least_squares import Calamity, EmpiricalBayes, SkyBased
-from calstudy.calibrate.calibrators.other_packages import Skycal
+from calstudy.calibrate.calibrators.least_squares import (
+    Calamity,
+    DelayWeighted,
+    EmpiricalBayes,
+    SkyBased,
+    Unified,
+)
+from calstudy.calibrate.calibrators.other_packages import Skycal, Solved
 from calstudy.calibrate.calibrators.redcal import Redcal
 from calstudy.calibrate.degeneracy import fix_phase
 from calstudy.calibrate.execution import run_calibrator
@@ -317,3 +323,43 @@ def test_where_weights_run_away_and_a_pass_fails(monkeypatch, fails, kept, statu
     assert calls[-1] == "equal"
     assert found.solution.record.status == status
     assert np.array_equal(found.solution.gains, np.ones_like(start) if kept == "equal" else noisy(1))
+
+
+@pytest.mark.parametrize(("spread", "status"), [(1.0, "max-steps"), (0.1, "max-steps")])
+def test_a_later_pass_of_another_package_that_fails_takes_no_gains_away(monkeypatch, spread, status):
+    """Weights that run away give the gains of equal weights; others those of the pass before."""
+    toy = make_toy(scattered(8), noise=0.1)
+    uvd = make_uvdata(toy, n_times=1)
+    gains = toy.gains * 10.0 ** (spread * np.random.default_rng(1).normal(size=toy.gains.shape))
+    passes = []
+
+    def stub(self, measured, groups, before=None):
+        passes.append(before)
+        if before is None:
+            return Solved(gains[..., None].copy(), [Solve("converged", "", seconds=0.0, cpu_seconds=0.0)])
+        return Solved(np.full((*gains.shape, 1), np.nan + 0j), [Solve("failed", "", seconds=0.0, cpu_seconds=0.0)])
+
+    monkeypatch.setattr(Skycal, "solve", stub)
+    result = run_calibrator(Skycal(), uvd, sky_of(uvd, toy.foregrounds))
+    assert len(passes) > 1
+    assert statuses(result) == [status]
+    rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(toy.positions)))
+    np.testing.assert_allclose(np.abs(result.gains.gain_array[rows, :, 0, 0]), np.abs(gains))
+    assert not result.gains.flag_array[rows].any()
+
+
+@pytest.mark.parametrize("calibrator", [SkyBased, Skycal])
+def test_a_range_that_cuts_the_array_is_refused(calibrator):
+    """Nothing tells the phase between two stations whose baselines are left out."""
+    stations = np.concatenate([scattered(4), np.add(scattered(4), [300.0, 0.0, 0.0])])
+    frame = Observation(make_uvdata(make_toy(stations), n_times=1))
+    assert calibrator().refusal(frame, True) is None
+    cut = calibrator(baselines=BaselineRange(longest="150 m"))
+    assert "leave 2 parts of the array unconnected" in cut.refusal(frame, True)
+
+
+@pytest.mark.parametrize("calibrator", [DelayWeighted, EmpiricalBayes, Unified])
+def test_a_solver_without_a_name_is_the_calibrators_own(calibrator):
+    for solver in ({"max_steps": 50}, {"name": "gauss-newton", "max_steps": 50}):
+        found = calibrator.model_validate({"solver": solver}).solver
+        assert (found.tolerance, found.max_steps) == (1e-5, 50)

@@ -7,16 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pyuvdata import UVFlag
-from toy import FREQUENCIES, make_toy, scattered
-from toy_data import ONE_SOLVE, SETTINGS, make_uvdata, sky_of, statuses
+from toy import FREQUENCIES, complex_normal, make_toy, scattered
+from toy_data import ONE_SOLVE, SETTINGS, errors, make_uvdata, sky_of, statuses
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Observation
 from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.calibrators.least_squares import DelayWeighted, SkyBased
+from calstudy.calibrate.calibrators.other_packages import Measured, Skycal
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.preparation import starting_gains
-from calstudy.calibrate.problem import gain_weights
+from calstudy.calibrate.problem import gain_products, gain_weights
 from calstudy.calibrate.settings import AutoWeights, FileStart, FileWeights, FlagWeights, ForegroundPrior, SampleWeights
 from calstudy.calibrate.weights import inverse_variances, make_weights
 from calstudy.realdata.noise import radiometer_variance, sample_noise
@@ -47,6 +48,39 @@ def test_sample_weights_follow_the_counts(toy):
     assert np.allclose(weights[4], 3 * weights[0])
     assert (weights[5] == 0).all()
     assert weights[np.arange(28) != 5].mean() == pytest.approx(1 / (28 * 64))
+
+
+@pytest.mark.parametrize("calibrator", [SkyBased, Skycal])
+def test_integrations_that_share_gains_keep_their_weights(calibrator):
+    """One of a hundred measurements beside a single one: the gains are at least as good as by the first alone."""
+    toy = make_toy(scattered(6), noise=0.1)
+    data, rng = make_uvdata(toy, 2), np.random.default_rng(3)
+    sky = sky_of(data, toy.foregrounds)
+    counts = np.array([1.0, 100.0])[:, None, None, None]
+    clean = gain_products(toy.gains, toy.antennas)[None, :, :, None] * to_cube(sky)
+    scale = 0.1 * np.sqrt(np.mean(np.abs(clean) ** 2))
+    data.data_array = (clean + scale * complex_normal(rng, clean.shape) / np.sqrt(counts)).reshape(
+        data.data_array.shape
+    )
+    data.nsample_array[:] = np.broadcast_to(counts, clean.shape).reshape(data.nsample_array.shape)
+    weights = make_weights(Observation(data), everything(data), SampleWeights(kind="nsamples"), [slice(0, 2)])
+    assert weights[1].sum() / weights[0].sum() == pytest.approx(100)
+    assert weights.sum() == pytest.approx(2)
+    rms = []
+    for together in (1, 2):
+        settings = calibrator(weights=SampleWeights(kind="nsamples"), integrations_per_solve=together)
+        rms.append(np.sqrt(np.mean(np.abs(errors(run_calibrator(settings, data, sky), toy, integration=1)) ** 2)))
+    assert rms[1] < 1.02 * rms[0]
+
+
+def test_weights_by_gains_of_a_group_keep_those_of_its_integrations():
+    toy = make_toy(scattered(5))
+    frame = Observation(make_uvdata(toy, 2))
+    weights = np.ones((2, *toy.foregrounds.shape)) * np.array([1.0, 100.0])[:, None, None]
+    measured = Measured(frame, weights, weights, weights)
+    found = measured.weighted_by(toy.gains[..., None], [slice(0, 2)]).weights
+    np.testing.assert_allclose(found[1], 100 * found[0])
+    assert found.sum() == pytest.approx(weights.sum())
 
 
 def test_auto_weights_are_inverse_variances():

@@ -48,8 +48,11 @@ class Measured:
         known = np.where(np.isfinite(gains) & (gains != 0), gains, 1)
         weights = self.weights.copy()
         for number, times in enumerate(groups):
-            products = gain_products(known[..., number], self.frame.antennas)
-            weights[times] = gain_weights(weights[times], np.broadcast_to(products, weights[times].shape))
+            part = weights[times]
+            products = np.broadcast_to(gain_products(known[..., number], self.frame.antennas), part.shape)
+            # As one array of baselines and channels.
+            rows = (values.reshape(-1, part.shape[2]) for values in (part, products))
+            weights[times] = gain_weights(*rows).reshape(part.shape)
         return replace(self, weights=weights)
 
     def keys(self, rows: np.ndarray) -> list[tuple[int, int, str]]:
@@ -103,12 +106,12 @@ class OtherPackage(WeightedFit):
             raise InputError(f"{self.label}: needs a sky model, and there is none")
         require_parallel_hands(observation.uvd)
         crosses = ~observation.autos
-        weights = make_weights(observation, crosses, self.weights)
+        groups = self.solves(observation.n_times)
+        weights = make_weights(observation, crosses, self.weights, groups)
         data, sky = observation.baselines(crosses), assumed.sky_model.baselines(crosses)
         if not (np.isfinite(data.visibilities) | data.flags).all():
             raise InputError(f"{self.label}: unflagged visibilities are not finite; flag them")
         factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths, data.antennas)[:, None]
-        groups = self.solves(data.n_times)
         gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
         outcomes: list[Solve] = []
         for p in range(data.n_polarizations):
@@ -162,18 +165,31 @@ class OtherPackage(WeightedFit):
         if not isinstance(settings, GainWeights):
             return solved
         passes, used, weights, before = 1, np.ones_like(solved.gains), measured.weights, np.full(len(groups), np.inf)
+        failed = np.zeros(len(groups), bool)
         while True:
             wanted = measured.weighted_by(solved.gains, groups).weights
             changes = np.array([weight_change(wanted[times], weights[times]) for times in groups])
+            # Weights of a pass that failed have not settled.
+            changes = np.where(failed, before, changes)
             if passes == settings.passes or max(changes) < settings.tolerance:
                 break
             used = np.where(changes > SLOW * before, _halfway(used, solved.gains), solved.gains)
-            solved = self.solve(measured, groups, solved._replace(gains=used))
+            found = self.solve(measured, groups, solved._replace(gains=used))
+            failed = np.array([not outcome.usable for outcome in found.outcomes])
+            solved = _chosen(failed, solved, found)
             passes, weights, before = passes + 1, measured.weighted_by(used, groups).weights, changes
-        gains = np.where(changes > RUNAWAY, first.gains, solved.gains) if passes > 1 else solved.gains
-        unsettled = [settings.unsettled(found) for found in changes]
-        ended = zip(solved.outcomes, changes.tolist(), unsettled, strict=True)
-        return Solved(gains, [_in_passes(*each, passes) for each in ended])
+        kept = _chosen((changes > RUNAWAY) & (passes > 1), first, solved)
+        unsettled = [settings.unsettled(change) for change in changes]
+        ended = zip(kept.outcomes, changes.tolist(), unsettled, strict=True)
+        return Solved(kept.gains, [_in_passes(*each, passes) for each in ended])
+
+
+def _chosen(chosen: np.ndarray, first: Solved, second: Solved) -> Solved:
+    """Return the first of two solves for the groups of a mask, (Ngroups,), and the second for the others."""
+    outcomes = [
+        one if is_first else other for is_first, one, other in zip(chosen, first.outcomes, second.outcomes, strict=True)
+    ]
+    return Solved(np.where(chosen, first.gains, second.gains), outcomes)
 
 
 def _halfway(used: np.ndarray, found: np.ndarray) -> np.ndarray:

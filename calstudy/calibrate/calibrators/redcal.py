@@ -108,7 +108,8 @@ class Redcal(OtherPackage):
             for first in range(0, n_times, step)
         ]
         gains, status, steps = (np.concatenate(parts, axis=-2) for parts in zip(*blocks, strict=True))
-        shared = np.stack([_average(gains[:, times]) for times in groups], axis=2)
+        weights = measured.weights.sum(axis=1)
+        shared = np.stack([_average(gains[:, times], weights[times]) for times in groups], axis=2)
         return Solved(shared, [self._outcome(status[times], steps[times]) for times in groups])
 
     def _solve_again(self, measured: Measured, groups: list[slice], before: Solved) -> Solved:
@@ -152,8 +153,8 @@ class Redcal(OtherPackage):
         return Solve(status="converged", message=f"omnical changed by less than {self.tolerance:g}", steps=longest)
 
 
-def _average(gains: np.ndarray) -> np.ndarray:
-    """Average gains (Nants, Ntimes, Nfreqs) over the integrations with a solution."""
+def _average(gains: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Average gains (Nants, Ntimes, Nfreqs) over the integrations with a solution, with weights (Ntimes, Nfreqs)."""
     known = np.isfinite(gains)
     values = np.where(known, gains, 0)
     reference = values[:, 0]
@@ -161,8 +162,9 @@ def _average(gains: np.ndarray) -> np.ndarray:
         # An integration without data has no phase to align; where the first has none, the next is the reference.
         values[:, t] = np.where(reference.any(axis=0), fix_phase(values[:, t], reference), values[:, t])
         reference = np.where(reference.any(axis=0), reference, values[:, t])
-    count = known.sum(axis=1)
-    return np.where(count > 0, values.sum(axis=1) / np.maximum(count, 1), np.nan)
+    used = np.where(known, weights, 0)
+    total = used.sum(axis=1)
+    return np.where(total > 0, (used * values).sum(axis=1) / np.where(total > 0, total, 1), np.nan)
 
 
 def _undetermined(antennas: np.ndarray, groups: RedundantGroups) -> str | None:
