@@ -105,9 +105,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a prior weighed against the noise of one of several measurements",
-        'None if self.levels is None else read_json(self.levels / LEVELS)["noise_std"]',
-        "None if self.levels is None else data.nsample_array.max() ** 0.5 * "
-        'read_json(self.levels / LEVELS)["noise_std"]',
+        "None if self.levels is None else read_noise(self.levels)",
+        "None if self.levels is None else data.nsample_array.max() ** 0.5 * read_noise(self.levels)",
         ("tests/calibrate/test_calibrate_command.py",),
     ),
     Mutation("noise in each part", "noise *= std / np.sqrt(2)", "noise *= std", CORRUPTION),
@@ -117,7 +116,7 @@ MUTATIONS = (
         "for area in areas], axis=-1) / samples",
         CORRUPTION,
     ),
-    Mutation("decibels of power", "10 ** (settings.eor_level / 10)", "10 ** (settings.eor_level / 20)", CORRUPTION),
+    Mutation("decibels of power", "10 ** (level / 10)", "10 ** (level / 20)", CORRUPTION),
     Mutation(
         "the noise of even and odd is the same",
         "(own or noise.seeds)[PARITIES.index(parity)]",
