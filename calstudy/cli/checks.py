@@ -77,7 +77,14 @@ def regress(
     for reference, run in made.items() if update else ():
         accept(run, reference)
         console.print(f"{reference}: updated", markup=False)
-    if not all(holds):
+    _leave(bool(made), all(holds))
+
+
+def _leave(any_made: bool, all_hold: bool) -> None:
+    """End with the exit status of a regression."""
+    if not any_made:
+        raise InputError("none of the references has results that could be made again")
+    if not all_hold:
         raise typer.Exit(EXIT_MOVED)
 
 

@@ -32,8 +32,10 @@ logger = logging.getLogger(__name__)
 
 # With a smaller fraction of its samples present, a data set has too few baselines at common times.
 MIN_PRESENT = 0.5
-# Baselines whose samples are so many times as far apart as those of others have been averaged more than these.
+# Baselines whose samples last so many times as long as those of others are apart have been averaged more than these.
 COPIED = 1.5
+# Part of the shortest duration by which times may differ that are one.
+SAME_TIME = 0.4
 # Range of radio telescopes, Hz; other values have another unit, or the file is damaged.
 LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e6, 1e12
 EVERYTHING = Selection()
@@ -230,8 +232,7 @@ def share_times(data: UVData, notes: list[str]) -> bool:
     shortest, longest = float(integration.min()), float(integration.max())
     if np.allclose(integration, shortest, rtol=0.01):
         return False
-    cadences = _cadences(data)
-    if cadences.max() < COPIED * cadences.min():
+    if not _averaged_differently(data):
         usual = float(np.median(integration))
         if data.nsample_array is not None:
             data.nsample_array = data.nsample_array * (integration / usual)[:, None, None]
@@ -247,7 +248,7 @@ def share_times(data: UVData, notes: list[str]) -> bool:
         "squared of copies is too low by their number."
     )
     middle = np.asarray(data.time_array)
-    tolerance = 0.4 * shortest / SECONDS_PER_DAY
+    tolerance = SAME_TIME * shortest / SECONDS_PER_DAY
     times = np.unique(middle)
     starts = np.concatenate([[True], np.diff(times) > tolerance])
     data.time_array = times[starts][np.cumsum(starts)[np.searchsorted(times, middle)] - 1]
@@ -256,18 +257,19 @@ def share_times(data: UVData, notes: list[str]) -> bool:
     return True
 
 
-def _cadences(data: UVData) -> np.ndarray:
-    """Return the median distance in time of the samples of each baseline, or the duration of a single one, in s."""
-    baselines, times = np.asarray(data.baseline_array), np.asarray(data.time_array)
+def _averaged_differently(data: UVData) -> bool:
+    """Whether samples of some baselines last longer than those of others are apart in time.
+
+    Baselines with gaps, or with shorter samples than others, have not been averaged more than these.
+    """
+    baselines, times = np.asarray(data.baseline_array), np.asarray(data.time_array) * SECONDS_PER_DAY
+    durations = np.asarray(data.integration_time, float)
     order = np.lexsort((times, baselines))
-    starts = np.flatnonzero(np.diff(baselines[order])) + 1
-    rows = np.split(order, starts)
-    return np.array(
-        [
-            np.median(np.diff(times[row])) * SECONDS_PER_DAY if row.size > 1 else data.integration_time[row[0]]
-            for row in rows
-        ]
-    )
+    rows = np.split(order, np.flatnonzero(np.diff(baselines[order])) + 1)
+    apart = [float(np.median(np.diff(times[row]))) for row in rows if row.size > 1]
+    if not apart:
+        return bool(np.ptp(times) > SAME_TIME * durations.min())
+    return max(float(np.median(durations[row])) for row in rows) > COPIED * min(apart)
 
 
 def _filled(data: UVData, notes: list[str]) -> UVData:

@@ -335,6 +335,10 @@ def test_references_that_cannot_be_made_again_do_not_stop_the_others(
     assert "broken: NOT MADE AGAIN" in told
     assert "sweep: left out" in told
     assert told.count(": holds") == 2, told
+    for name in ("tiny", "zz-last"):
+        shutil.rmtree(folder / name)
+    nothing = CliRunner().invoke(app, ["regress", str(folder), *arguments])
+    assert isinstance(nothing.exception, InputError)
 
 
 @pytest.mark.parametrize(
