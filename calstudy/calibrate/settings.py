@@ -307,7 +307,7 @@ class ForegroundPrior(Section):
 
 
 def _unconnected_parts(antennas: np.ndarray) -> int:
-    """Return into how many parts without a baseline between them baselines, (Nbls, 2), connect their antennas."""
+    """Count the parts of an array between which there is no baseline, from the antennas of baselines, (Nbls, 2)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -59,9 +59,8 @@ def common_baselines(sky: UVData, data: UVData, autos: bool) -> tuple[UVData, UV
     Cross-correlations that the sky model lacks are left out of the data. Autocorrelations that it lacks stay, with a
     sky model of zero, unless they are fitted (`autos`): weights may need them. Samples that are flagged in the sky
     model are flagged in the returned data. The inputs are from `calstudy.realdata.reading.prepare`, and not changed;
-    the returned sky model has the samples of the returned data,
-    in their order. Raises InputError if no cross-correlation is in both, all are zero or flagged in the
-    sky model, or as `match_sky_model`.
+    the returned sky model has the samples of the returned data, in their order. Raises InputError if no
+    cross-correlation is in both, all are zero or flagged in the sky model, or as `match_sky_model`.
     """
     known = {frozenset(pair) for pair in zip(sky.ant_1_array.tolist(), sky.ant_2_array.tolist(), strict=True)}
     pairs = list(zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True))

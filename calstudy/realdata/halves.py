@@ -41,8 +41,8 @@ class Facts:
     `sidereal_times` (rad) are (Ntimes,); `integration` is the duration of the shortest one, s. `autos` is true if there
     are autocorrelations of all antennas. `copied` is true if averaging in time differs between baselines, so that long
     samples are copied to the times of short ones. `pol_convention` is that of pyuvdata, None if the files do not tell
-    it. `polarizations` are those of parallel hands, as pyuvdata numbers
-    them; where power spectra are made x is the eastern feed, whatever the file calls it.
+    it. `polarizations` are those of parallel hands, as pyuvdata numbers them; where power spectra are made x is the
+    eastern feed, whatever the file calls it.
     """
 
     unit: str
@@ -219,13 +219,6 @@ def modelled(frame: Frame, path: Path) -> Frame:
             "number)"
         )
     return frame.baselines(chosen | frame.autos)
-
-
-def pol_convention_of(path: Path) -> str | None:
-    """Return what pyuvdata calls the `pol_convention` of a file, or None if the file does not tell it."""
-    from calstudy.realdata.reading import read_metadata
-
-    return read_metadata((path,)).pol_convention
 
 
 def _require_even(frequencies: np.ndarray) -> None:

@@ -197,8 +197,8 @@ def field_reference() -> str:
     lines = [
         "# Experiment files",
         "",
-        "An experiment file is YAML. Everything but `name` has a default: the paper's value where it has one, but for",
-        'few. Physical quantities are written with their unit (`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a',
+        "An experiment file is YAML. Everything but `name` has a default, that of the paper with few exceptions.",
+        'Physical quantities are written with their unit (`"80 kHz"`, `100 ns`, `-40 dB`). Where a block is a',
         "choice, its name alone stands for it with its defaults: `beam: airy` is `beam: {kind: airy}`. Relative paths",
         "of input files start at the experiment file. `calstudy fields SECTION` prints one section of this page.",
         "",

@@ -325,8 +325,8 @@ def test_where_weights_run_away_and_a_pass_fails(monkeypatch, fails, kept, statu
     assert np.array_equal(found.solution.gains, np.ones_like(start) if kept == "equal" else noisy(1))
 
 
-@pytest.mark.parametrize(("spread", "status"), [(1.0, "max-steps"), (0.1, "max-steps")])
-def test_a_later_pass_of_another_package_that_fails_takes_no_gains_away(monkeypatch, spread, status):
+@pytest.mark.parametrize("spread", [1.0, 0.1])
+def test_a_later_pass_of_another_package_that_fails_takes_no_gains_away(monkeypatch, spread):
     """Weights that run away give the gains of equal weights; others those of the pass before."""
     toy = make_toy(scattered(8), noise=0.1)
     uvd = make_uvdata(toy, n_times=1)
@@ -342,7 +342,7 @@ def test_a_later_pass_of_another_package_that_fails_takes_no_gains_away(monkeypa
     monkeypatch.setattr(Skycal, "solve", stub)
     result = run_calibrator(Skycal(), uvd, sky_of(uvd, toy.foregrounds))
     assert len(passes) > 1
-    assert statuses(result) == [status]
+    assert statuses(result) == ["max-steps"]
     rows = np.isin(result.gains.ant_array, 10 + 2 * np.arange(len(toy.positions)))
     np.testing.assert_allclose(np.abs(result.gains.gain_array[rows, :, 0, 0]), np.abs(gains))
     assert not result.gains.flag_array[rows].any()

@@ -17,7 +17,7 @@ from calstudy.instrument.interface import model_of
 from calstudy.power.interface import require_antennas
 from calstudy.power.settings import PowerSettings
 from calstudy.products.table import tables_of
-from calstudy.realdata.halves import PARITIES, Parts, pol_convention_of, require_same_samples, require_same_sky
+from calstudy.realdata.halves import PARITIES, Parts, require_same_samples, require_same_sky
 from calstudy.realdata.settings import InjectionSettings, ObservedSettings
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
@@ -66,7 +66,9 @@ class ObservedStudy(DataStudy):
         found = ("flux scale: autocorrelations at an assumed system temperature",) if assumed else ()
         if (assumed and sky is None) or section.pol_convention is not None:
             return found
-        told = self.data.facts["even"].pol_convention if sky is None else pol_convention_of(sky)
+        from calstudy.realdata.reading import read_metadata
+
+        told = (self.data.facts["even"] if sky is None else read_metadata((sky,))).pol_convention
         return found if told else (*found, "I = XX + YY (pol_convention)")
 
     @property
