@@ -115,7 +115,7 @@ def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **
 @_typed
 def open_run(folder: str | Path) -> OpenRun:
     """Open the folder of a finished run; raises InputError for another folder."""
-    return OpenRun(RunFolder(Path(folder)))
+    return OpenRun(RunFolder(Path(folder).resolve()))
 
 
 @_typed
@@ -168,7 +168,7 @@ class CalibratedData:
     """The results of `calibrate_data`, which are read from their folder when they are asked for."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder = folder = folder.resolve()
         self.solution: Mapping[str, Any] = read_json(folder / SOLUTION)
         """Content of solution.json: settings, changes of the data, what stands out, and every solve."""
 
@@ -527,7 +527,13 @@ class OpenRun:
         return _single(self._study)
 
     def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
-        return ByVariant(self._folder.tables.variants, read)
+        if not (names := self._folder.tables.variants):
+            raise InputError(f"{self.name}: has no spectra by variant; {self._remedy}")
+        return ByVariant(names, read)
+
+    @property
+    def _remedy(self) -> str:
+        return "take one of its parts" if self.parts else "run the experiment again"
 
     def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
         return lambda name: by_wavenumber(self._folder.tables.spherical(name, modes))
@@ -560,7 +566,7 @@ class OpenRun:
                 return product.path
         raise InputError(
             f"{task.stage.name} ({task.label}): is not in the store {stores[-1].root}, or was made by another version; "
-            "run the study again"
+            "start Python in the folder in which the study was run, or run it again"
         )
 
     def _stores(self, outputs: Folders) -> list[Store]:
@@ -588,7 +594,9 @@ def _plain(value: Any, path: str = "") -> Any:
     if hasattr(value, "unit") and hasattr(value, "value"):
         if getattr(value, "shape", ()):
             return [_plain(item, path) for item in value]
-        return f"{_plain(value.value, path)!r} {value.unit}" if str(value.unit) else _plain(value.value, path)
+        # astropy.cosmology.units.littleh
+        unit = str(value.unit).replace("littleh / Mpc", "h/Mpc")
+        return f"{_plain(value.value, path)!r} {unit}" if unit else _plain(value.value, path)
     if hasattr(value, "tolist"):
         return _plain(value.tolist(), path)
     if isinstance(value, PurePath):
@@ -607,7 +615,8 @@ def _half(half: str) -> str:
 
 def _single(study: Study) -> ExperimentStudy:
     if not isinstance(study, ExperimentStudy):
-        raise InputError(f"{study.name}: has several experiments; take one of its parts")
+        remedy = "take one of its parts" if study.parts else "its numbers are in its tables and scores"
+        raise InputError(f"{study.name}: has several experiments; {remedy}")
     return study
 
 

@@ -10,6 +10,7 @@ from tiny import tiny
 
 from calstudy.base.errors import InputError
 from calstudy.experiment.files import override, validate
+from calstudy.figures.convergence import ConvergencePath, draw_convergence
 from calstudy.run.execution import Budget
 from calstudy.studies.kinds.experiment import ExperimentStudy
 from calstudy.studies.study import run_study
@@ -53,6 +54,18 @@ def test_the_bias_falls_with_the_steps_and_stays_below_what_is_predicted(figures
         assert bias[0] > 10 * abs(bias[-1])
         assert (bias[1:] - 3 * error[1:] < 2 * predicted[1:]).all()
     assert (figures / "convergence.png").exists()
+
+
+def test_negative_powers_are_drawn_as_open_symbols_in_both_panels():
+    power = np.array([10.0, 1.5, -0.2, -0.3])
+    path = ConvergencePath("fit", np.array([1, 10, 100, 1000]), power, 0.1 * abs(power), power, 0.1 * abs(power), power)
+    for axes in draw_convergence([path], [0]).axes:
+        low, high = axes.get_ylim()
+        drawn = [y for container in axes.containers for y in container.lines[0].get_ydata()]
+        assert sorted(drawn) == [0.2, 0.3, 1.5, 10.0]
+        assert low < 0.2 < 10 < high
+        hollow = [container for container in axes.containers if container.lines[0].get_markerfacecolor() == "white"]
+        assert [list(container.lines[0].get_ydata()) for container in hollow] == [[0.2, 0.3]]
 
 
 def test_expected_and_measured_loss_are_drawn_from_the_same_bins(figures):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from astropy import units
+from astropy.cosmology import units as cosmology_units
 from matplotlib.figure import Figure
 from tiny import tiny
 
@@ -70,6 +71,54 @@ def test_numbers_of_numpy_and_paths_are_plain_ones(file, tmp_path):
     assert calstudy.load(content).experiment.instrument.times.count == 3
     with pytest.raises(InputError, match=r"power = .*a object cannot be in a file"):
         calstudy.load(file, power=object())
+
+
+def test_wavenumbers_of_astropy_are_in_units_of_h(file):
+    width = 0.08 * cosmology_units.littleh / units.Mpc
+    assert calstudy.load(file, **{"power.bins.width": width}).experiment.power.bins.width == pytest.approx(0.08)
+
+
+def positions(path, north):
+    path.write_text(f"number,east_m,north_m,up_m\n0,0,0,0\n1,12,0,0\n2,26,{north},0\n3,45,-3,0\n")
+    return {"kind": "csv", "path": str(path)}
+
+
+@pytest.mark.parametrize("named_in", ["calibration.assumed", "sweep"])
+def test_a_run_folder_is_that_of_the_content_of_files_that_are_named_by_their_paths_alone(tmp_path, named_in):
+    true, other = positions(tmp_path / "true.csv", 2), positions(tmp_path / "other.csv", 2.5)
+    value = [true, other] if named_in == "sweep" else other
+    changes = {"instrument.layout": true, "instrument.location": "mwa", named_in: {"instrument.layout": value}}
+
+    def folder():
+        return calstudy.load("quickstart", **changes).folder
+
+    before = folder()
+    assert folder() == before
+    positions(tmp_path / "other.csv", 3)
+    assert folder() != before
+
+
+def test_a_variant_is_added_to_those_of_every_experiment():
+    def variants(**changes):
+        return calstudy.load("quickstart", **{"outputs.figures": ["layout"]}, **changes).experiment.variants
+
+    added, usual = variants(**{"variants.mine": {"components": ["eor", "noise"]}}), variants()
+    assert added == usual | {"mine": added["mine"]}
+    changed = variants(**{"variants.residual.calibrate": False})
+    assert (changed["residual"].calibrate, changed["residual"].effects) == (False, usual["residual"].effects)
+
+
+def test_an_opened_run_is_found_from_any_folder(run, monkeypatch, tmp_path):
+    monkeypatch.chdir(run.folder.parent)
+    opened = calstudy.open_run(run.folder.name)
+    monkeypatch.chdir(tmp_path)
+    assert opened.spectra["residual"].identical(run.spectra["residual"])
+
+
+def test_every_array_has_its_unit(run):
+    found = run.spectra["residual"]
+    assert all("units" in found[name].attrs for name in (*found.data_vars, *found.coords))
+    assert found["n_modes"].attrs["units"] == run.transfer["transfer"].attrs["units"] == ""
 
 
 def test_a_dictionary_is_the_content_of_a_file(file):

@@ -11,5 +11,7 @@ SIDEREAL_DAY = 0.99726956633
 """Days after which the stars are at the same place."""
 SAME_LENGTH = 1e-3
 """Lengths on the ground that differ by at most this, m, are the same but for rounding."""
+UNEVEN = 1e-3
+"""Channels whose distances differ by at most this part of the mean are equally spaced: files round them."""
 SIGMAS_95 = 1.96
 """Half-width of a 95 % interval, in standard deviations."""

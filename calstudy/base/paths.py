@@ -94,3 +94,12 @@ def differences(first: Any, second: Any, path: str = "") -> Iterator[tuple[str, 
             yield from differences(first.get(key), second.get(key), f"{path}.{key}" if path else key)
     elif first != second:
         yield path, first, second
+
+
+def texts(value: Any) -> Iterator[str]:
+    """Yield all texts in nested blocks and lists."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from texts(item)

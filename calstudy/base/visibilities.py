@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calstudy.base.errors import InputError
+
 if TYPE_CHECKING:
     from pyuvdata import Telescope, UVData
 
@@ -125,13 +127,29 @@ def baseline_vectors(uvd: UVData) -> np.ndarray:
 
 
 def use_bundled_earth_orientation() -> None:
-    """Prevent astropy from downloading Earth orientation tables; the installed tables cover the simulated date.
+    """Prevent astropy from downloading Earth orientation tables, and let it use predictions of the installed ones.
 
     Call it in every process that computes sidereal times or source positions.
     """
     from astropy.utils import iers
 
     iers.conf.auto_download = False
+    # Predictions of a year ahead err by less than a second, and there is no newer table to ask for.
+    iers.conf.auto_max_age = None
+
+
+def require_earth_orientation(times: np.ndarray, field: str) -> None:
+    """Raise InputError if the installed Earth orientation tables end before the last of the times, Julian dates."""
+    from astropy.time import Time
+    from astropy.utils import iers
+
+    use_bundled_earth_orientation()
+    last, known = Time(times.max(), format="jd"), Time(iers.earth_orientation_table.get()["MJD"][-1], format="mjd")
+    if last > known:
+        raise InputError(
+            f"{field}: is of {last.iso[:10]}, and the rotation of the Earth is known up to {known.iso[:10]}: update "
+            "the package astropy-iers-data"
+        )
 
 
 def new_observation(

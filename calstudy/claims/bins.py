@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,13 +70,18 @@ def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float,
 
 
 def recovered_outside_wedge(run: Results, k_min: float, k_max: float = np.inf) -> Finding:
-    """Return what `recovered` does, of a run outside the wedge, with the error of what is left without EoR in it."""
+    """Return what `recovered` does, of a run outside the wedge, with the errors of what is left without EoR and of s.
+
+    The flux scale s differs between draws of gains and noise by more than the noise of P^R. How far it is from 1 in
+    this run is the one sample of that.
+    """
     residual, eor = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
     found, used = recovered(residual, eor, k_min, k_max), used_bins(residual, eor, k_min=k_min, k_max=k_max)
     signal, error = eor.power.real[used], residual.difference_error[used]
     weights = signal / error**2
     left = np.sum(weights * error_of_what_is_left(run)[used]) / np.sum(weights * signal)
-    return found._replace(uncertainty=float(np.hypot(found.uncertainty, left)))
+    of_scale = found.value * (1 - run.score.flux_scale**2)
+    return found._replace(uncertainty=float(np.linalg.norm([found.uncertainty, left, of_scale])))
 
 
 def fraction_within(value: np.ndarray, error: np.ndarray) -> Finding:
@@ -96,38 +100,6 @@ def ratio(above: Finding, below: Finding) -> Finding:
     """Return the ratio of two numbers with independent errors."""
     value = above.value / below.value
     return Finding(value, abs(value) * np.hypot(above.uncertainty / above.value, below.uncertainty / below.value))
-
-
-@dataclass(frozen=True)
-class RecoveredPower:
-    """Quantities by which two runs are compared, in the same bins.
-
-    `loss_error` is the standard deviation of the transfer function, (Nk,), and of what is left without EoR: the runs
-    lose and leave different amounts by chance.
-    """
-
-    residual: SphericalSpectrum
-    eor: SphericalSpectrum
-    loss_error: np.ndarray
-
-
-def difference_of_ratios(first: RecoveredPower, second: RecoveredPower, used: np.ndarray) -> Finding:
-    """Return P^R / P^S of one run minus that of another: the mean of the differences of single bins, (Nk,) bool.
-
-    Each bin has the same weight in both runs, the inverse variance of its difference, so that a difference between
-    the runs cannot come from the averaging of bins with different ratios. Noise is independent from bin to bin. The
-    chance losses to the gains are taken as common to all bins, because they share the gains.
-    """
-    ratios, variances, common = [], [], []
-    for run in (first, second):
-        signal = run.eor.power.real[used]
-        ratios.append(run.residual.power.real[used] / signal)
-        variances.append((run.residual.difference_error[used] / signal) ** 2)
-        common.append(run.loss_error[used])
-    weights = 1 / sum(variances)
-    weights /= weights.sum()
-    error = np.sqrt(np.sum(weights**2 * sum(variances)) + sum(np.sum(weights * part) ** 2 for part in common))
-    return Finding(float(np.sum(weights * (ratios[0] - ratios[1]))), float(error))
 
 
 def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
@@ -154,35 +126,6 @@ def difference_of_losses(first: Results, second: Results, k_min: float, k_max: f
     difference = one.scale_free_transfer - other.scale_free_transfer
     error = np.hypot(one.scale_free_transfer_error, other.scale_free_transfer_error)
     return mean_of_common_errors(difference[used], error[used])
-
-
-def bias_extent(residual: SphericalSpectrum, eor: SphericalSpectrum) -> Finding:
-    """Return the wavenumber in h/Mpc up to which P^R is below P^S by more than its 95 % error.
-
-    It is the upper edge of the last such bin before two successive bins without a bias. The lowest bin, which has
-    few modes, may be unbiased if the next is biased. Without any bias it is the lower edge of the first bin. The
-    uncertainty is that of a uniform distribution over a bin, or the change for deviations of 3 sigma instead of 95 %
-    if that is larger.
-    """
-    used = np.flatnonzero(used_bins(residual, eor))
-    pull = ((eor.power.real - residual.power.real) / residual.difference_error)[used]
-    edges = residual.bin_edges
-    ends = [
-        edges[used[0]] if last is None else edges[used[last] + 1]
-        for last in map(_last_biased, (pull > SIGMAS_95, pull > 3))
-    ]
-    return Finding(float(ends[0]), max(float(np.diff(edges)[0] / np.sqrt(12)), float(abs(ends[0] - ends[1]))))
-
-
-def _last_biased(biased: np.ndarray) -> int | None:
-    """Return the index of the last biased bin before two unbiased ones, or None if the first two are unbiased."""
-    last = None
-    for place, is_biased in enumerate(biased):
-        if is_biased:
-            last = place
-        elif place - (-1 if last is None else last) > 1:
-            break
-    return last
 
 
 def _without_eor(run: Results, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

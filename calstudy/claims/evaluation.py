@@ -180,7 +180,7 @@ def _measured_on(statement: Statement, runs: Mapping[str, Any]) -> tuple[Stateme
     """Return a statement, with its measure on realizations if these play its roles, and the runs for its measure."""
     played = [runs[role] for role in statement.roles if role in runs]
     if statement.pooled and played and all(isinstance(run, PooledResults) for run in played):
-        quantity = f"{statement.quantity}; mean over bins and realizations, error by their scatter"
+        quantity = f"{statement.quantity}; mean over realizations, error by their scatter"
         return replace(statement, measure=statement.pooled, quantity=quantity), dict(runs)
     return statement, {role: run for role, run in runs.items() if not isinstance(run, PooledResults)}
 
@@ -340,7 +340,7 @@ def claims(
     )
 
 
-class Claims(Task, stage="claims", version=15, cost=Cost(1, disk=1e5)):
+class Claims(Task, stage="claims", version=16, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on one run, or on the members of a collection in the roles that they play."""
 
     papers: Sequence[Any]
@@ -371,7 +371,7 @@ def _run_times(name: str, tables: Tables) -> RunTimeTable:
     return RunTimeTable.read(name, tables.path(RUNTIME, "the run has no table of run times"))
 
 
-class RunTimeClaims(Task, stage="runtime-claims", version=4, cost=Cost(1, disk=1e5)):
+class RunTimeClaims(Task, stage="runtime-claims", version=5, cost=Cost(1, disk=1e5)):
     """The statements of papers, evaluated on a run-time study."""
 
     papers: Sequence[Paper]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.experiment.model import Experiment
 from calstudy.experiment.realizations import expand_realizations, members
 from calstudy.instrument.layouts import make_array, redundant_groups
@@ -17,6 +18,31 @@ from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
 ARRAYS = "realizations.npz"
+
+
+def bias_extent(ratio: np.ndarray, error: np.ndarray, edges: np.ndarray) -> float:
+    """Return the wavenumber in h/Mpc up to which P^R / P^S, (Nk,) in bins of k, is below 1 by more than its 95 % error.
+
+    It is the upper edge of the last such bin before two successive bins without a bias. The lowest bin, which has
+    few modes, may be unbiased if the next is biased. Without any bias it is the lower edge of the first bin with modes.
+    Raises Unevaluated if no bin has any.
+    """
+    used = np.flatnonzero(np.isfinite(ratio) & np.isfinite(error))
+    if not used.size:
+        raise Unevaluated("no bins have modes in all realizations")
+    last = _last_biased((1 - ratio[used]) / error[used] > SIGMAS_95)
+    return float(edges[used[0]] if last is None else edges[used[last] + 1])
+
+
+def _last_biased(biased: np.ndarray) -> int | None:
+    """Return the index of the last biased bin before two unbiased ones, or None if the first two are unbiased."""
+    last = None
+    for place, is_biased in enumerate(biased):
+        if is_biased:
+            last = place
+        elif place - (-1 if last is None else last) > 1:
+            break
+    return last
 
 
 @dataclass(frozen=True)
@@ -63,6 +89,16 @@ class PooledResults:
         if not np.isfinite(found.value):
             raise Unevaluated(f"no modes between k = {k_min:g} and {k_max:g} h/Mpc in all realizations")
         return found
+
+    def bias_extent(self, modes: str) -> Finding:
+        """Return the k up to which P^R is biased (`bias_extent`), h/Mpc, of one realization.
+
+        It is their mean, with the scatter of single ones, as is that of a paper. `modes` are those of `mean`.
+        """
+        values, errors = (self.arrays[f"{modes}.{kind}.ratio"] for kind in ("values", "quoted"))
+        edges = self.arrays[f"{modes}.bin_edges"]
+        found = [bias_extent(*one, edges) for one in zip(values, errors, strict=True)]
+        return Finding(float(np.mean(found)), float(np.std(found, ddof=1)))
 
     @property
     def _design(self) -> Design:

@@ -29,6 +29,9 @@ INCOMPLETE = ("sky.foregrounds.flux_limit", "sky.foregrounds.count")
 """Fields of the assumed sky that leave sources out."""
 INVERSE_VARIANCES = ("gains", "autos")
 """Kinds of weights that are inverse variances."""
+EXPECTED_AT, EXPECTED = 0.3, (2.0, 200.0)
+"""Wavenumber, h/Mpc, and Delta^2 = k^3 P / (2 pi^2) there, mK^2, of an EoR as expected: about 20, to an order of
+magnitude."""
 SMOOTH = 100e-9
 """Largest delay of gains that are smooth in frequency, s."""
 
@@ -137,6 +140,19 @@ def require_long_baselines(run: Results, k: float) -> None:
         raise Unevaluated(
             f"the longest baseline that gains are fitted to has {longest:.0f} m; its horizon and the buffer reach "
             f"{reached:.2f} h/Mpc, not {k:g}, so that errors of the model cannot reach all of the window"
+        )
+
+
+def require_expected_signal(run: Results) -> None:
+    """Raise Unevaluated unless the simulated EoR is as strong as the signal that is expected of reionization."""
+    eor, (low, high) = run.spherical("eor", "outside-wedge"), EXPECTED
+    known = np.flatnonzero(np.isfinite(eor.power.real))
+    place = known[np.argmin(np.abs(eor.k[known] - EXPECTED_AT))]
+    found = float(eor.k[place] ** 3 * eor.power.real[place] / (2 * np.pi**2))
+    if not low <= found <= high:
+        raise Unevaluated(
+            f"the EoR has Delta^2 = {found:.2g} mK^2 at k = {eor.k[place]:.2g} h/Mpc, and the sentence is on the "
+            f"expected signal, {low:g} to {high:g}: choose another corruption.eor_level"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.package_files import find_experiment
-from calstudy.base.paths import value_at, with_value
+from calstudy.base.paths import texts, value_at, with_value
 from calstudy.base.plugins import FILE_REFERENCE
 from calstudy.calibrate.interface import CALIBRATORS
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, AssumedFile, assumed_changes, assumed_world
@@ -150,6 +150,8 @@ def read_mapping(path: Path, example: str = "name: quickstart") -> dict[str, Any
 M = TypeVar("M", bound=BaseModel)
 TAGS = {"solver": "name", "calibration": CALIBRATORS.tag}
 """Field that a bare string sets, where a block may be written as a string; elsewhere its `kind`."""
+NAMES = ("calibrators", "kind", "study", *TAGS.values())
+"""Keys of names, which are no paths even where a folder has such a name."""
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -163,8 +165,9 @@ def parse_override(text: str) -> tuple[str, Any]:
 def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a copy of `data`, the content of an experiment file, with the field at the dotted path set to `value`.
 
-    Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that is missing in the data starts as the
-    default of an experiment. Keys of the data may themselves be dotted paths, as those of ``calibration.assumed`` are.
+    Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that is missing in the data, or a mapping
+    of names such as ``variants``, starts as the default of an experiment. Keys of the data may themselves be dotted
+    paths, as those of ``calibration.assumed`` are.
     """
     return with_value(data, path, value, _block_for)
 
@@ -177,14 +180,18 @@ def overridden(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str,
     return result
 
 
+OF_NAMES = ("variants", "outputs.convergence.solvers")
+"""Fields whose keys are names that a user chooses."""
+
+
 def _block_for(path: str, given: Any) -> dict[str, Any] | list[Any] | None:
-    """Return the block for a name that stands for it, or the list or the empty block for a missing value."""
+    """Return the block for a name that stands for it, or the default list, entries or empty block in place of none."""
     if isinstance(given, str):
         return {TAGS.get(path.rpartition(".")[2], "kind"): given}
     if given is not None:
         return None
     default = value_at(Experiment(name="default").model_dump(mode="json"), path)
-    return default if isinstance(default, list) else {}
+    return default if isinstance(default, list) or path in OF_NAMES else {}
 
 
 def short_names(paths: Sequence[str]) -> dict[str, str]:
@@ -351,15 +358,19 @@ def with_absolute_paths(content: Any, read: Iterable[BaseModel], folder: Path) -
 
     What was `read` from the content says which of its texts are paths.
     """
-    used = {text for item in read for text in _texts(item.model_dump(mode="json")) if text.startswith("/")}
+    used = {text for item in read for text in texts(item.model_dump(mode="json")) if text.startswith("/")}
 
-    def absolute(value: Any) -> Any:
+    def absolute(value: Any, at: str = "") -> Any:
         if isinstance(value, Mapping):
-            return {key: absolute(item) for key, item in value.items()}
+            # In place of a block of its settings, a calibrator may have its name alone.
+            alone = at == "calibrators"
+            return {key: absolute(item, at if alone and isinstance(item, str) else key) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return type(value)(map(absolute, value))
         if isinstance(value, str):
             file = FILE_REFERENCE.fullmatch(value)
+            if file is None and at in NAMES:
+                return value
             path = value if file is None else file["path"]
             # A text that is no path may have no home folder, or characters that no path has.
             with suppress(RuntimeError, ValueError, OSError):
@@ -368,15 +379,6 @@ def with_absolute_paths(content: Any, read: Iterable[BaseModel], folder: Path) -
         return value
 
     return absolute(content)
-
-
-def _texts(value: Any) -> Iterator[str]:
-    """Yield all texts in nested blocks and lists."""
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping | list):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _texts(item)
 
 
 def dump(content: BaseModel) -> str:

@@ -19,7 +19,7 @@ from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.settings import PowerSettings
 from calstudy.simulate.settings import SimulationSettings
-from calstudy.sky.settings import SkySettings
+from calstudy.sky.settings import SkySettings, SyntheticDiffuse
 
 Component = Literal["foregrounds", "eor", "noise"]
 SIGNAL_LOSS_VARIANTS = ("residual", "residual_without_eor", "eor")
@@ -232,17 +232,6 @@ class Experiment(Section):
         return self
 
     @model_validator(mode="after")
-    def _modes_are_outside_the_wedge(self) -> Experiment:
-        reach = 0.5 / self.instrument.channels.width
-        if self.power.wedge_buffer >= reach:
-            raise fault(
-                "power.wedge_buffer",
-                f"is {1e6 * self.power.wedge_buffer:g} us, and delays reach {1e6 * reach:.4g} us with channels of this "
-                "width, so that no mode is outside the wedge; give a smaller one, or narrower channels",
-            )
-        return self
-
-    @model_validator(mode="after")
     def _what_needs_noise_has_it(self) -> Experiment:
         if self.corruption.noise.kind != "none":
             return self
@@ -282,6 +271,13 @@ class Experiment(Section):
                 # Effects are compared with each other, and with their drifts, by `CorruptionSettings`.
                 if seed == its is not None and not (other.startswith("corruption.effects") or other == path):
                     raise fault(path, f"is {seed}, as that of {other}: give one of them another")
+        return self
+
+    @model_validator(mode="after")
+    def _foregrounds_and_eor_are_independent(self) -> Experiment:
+        diffuse, eor = self.sky.diffuse, self.sky.eor
+        if isinstance(diffuse, SyntheticDiffuse) and eor.spectrum != "flat" and diffuse.seed == eor.seed:
+            raise fault("sky.diffuse.seed", f"is {diffuse.seed}, as that of sky.eor: give one of them another")
         return self
 
     @property

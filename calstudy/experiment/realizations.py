@@ -10,6 +10,7 @@ from calstudy.base.errors import ExperimentError, InputError
 from calstudy.corrupt.interface import GainEffect
 from calstudy.corrupt.noise import NoNoise
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
+from calstudy.sky.settings import SyntheticDiffuse
 
 PARTS = ("eor", "gains", "noise")
 """Parts that can be drawn again."""
@@ -121,7 +122,21 @@ def _faults(experiment: Experiment) -> list[str]:
         faults.append(
             "realizations: draw 'gains', but no effect on the gains in corruption.effects, nor a drift, has a seed"
         )
-    return faults or _coinciding_seeds(experiment)
+    return faults or _seeds_of_skies(experiment) or _coinciding_seeds(experiment)
+
+
+def _seeds_of_skies(experiment: Experiment) -> list[str]:
+    """Return a sentence if the EoR of a realization would have the random numbers of diffuse emission."""
+    diffuse, eor = experiment.sky.diffuse, experiment.sky.eor
+    count = max([block.count for block in experiment.realizations if "eor" in block.draw], default=1)
+    if not isinstance(diffuse, SyntheticDiffuse) or eor.spectrum == "flat":
+        return []
+    if diffuse.seed not in range(eor.seed, eor.seed + SEED_STEP * count, SEED_STEP):
+        return []
+    return [
+        f"realizations: the seed {diffuse.seed} would be used for sky.diffuse and for the EoR (seeds grow by "
+        f"{SEED_STEP} from one realization to the next); choose another in sky.diffuse"
+    ]
 
 
 def _coinciding_seeds(experiment: Experiment) -> list[str]:

@@ -105,7 +105,7 @@ def _scale(axes: Axes, name: str, cases: Iterable[Case]) -> None:
 
     Bars may reach beyond the limits: the largest ones would make the other points too small to read.
     """
-    values = np.concatenate([getattr(case.bins, name)[_used(case, name)] for case in cases])
+    values = np.array([value for case in cases for value in getattr(case.bins, name)[_used(case, name)]])
     if not values.size:
         return
     low, high = min(values.min(), 0.0), max(values.max(), REFERENCE[name])
@@ -193,6 +193,7 @@ VARIANT_HEIGHT, HEADING_HEIGHT = 0.21, 0.45
 SPREAD = 0.7
 """Part of a row over which its symbols are spread."""
 LOWEST = 1e-2
+"""Lower end of the axis of a bias, unless a smaller one is drawn."""
 
 
 def variants(labels: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -285,7 +286,8 @@ def _draw_panel(
                     # Below the symbols, so that open ones stay open.
                     axes.plot(*at, **{**CROSS, "zorder": 1})
     axes.set_xscale("log")
-    axes.set_xlim(left=LOWEST)
+    smallest = min((value for line in axes.lines for value in np.atleast_1d(line.get_xdata()) if value > 0), default=1)
+    axes.set_xlim(left=min(LOWEST, smallest / 2))
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.axvline(1, color=style.GREY, linewidth=0.7, linestyle="--", zorder=0)
     for edge in np.arange(len(rows) - 1) + 0.5:
@@ -296,7 +298,7 @@ def _draw_panel(
 class ComparisonVariants(CasesFigure):
     """Bias of calibrators in variants and in variants of worlds: of labels such as ``sky-based, autos``."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     kind: str = "comparison-variants"
     caption = (

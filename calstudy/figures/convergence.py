@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -63,15 +63,9 @@ def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[in
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2)
     for path, (marker, colour) in zip(paths, style.SERIES, strict=False):
-        _draw_bias(left, path, marker, colour)
-        right.errorbar(
-            path.steps,
-            path.with_eor,
-            SIGMAS_95 * path.with_eor_error,
-            fmt=marker + "-",
-            color=colour,
-            label=path.solver,
-        )
+        _draw_path(left, path, (path.bias, path.bias_error), marker, colour)
+        left.plot(path.steps, np.where(path.predicted > 0, path.predicted, np.nan), color=colour, linestyle="--")
+        _draw_path(right, path, (path.with_eor, path.with_eor_error), marker, colour)
     left.plot([], [], color=style.GREY, linestyle="--", label="predicted where it stopped")
     for axes, label in ((left, BIAS), (right, TOTAL)):
         axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
@@ -89,14 +83,17 @@ def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[in
     return figure
 
 
-def _draw_bias(axes: Axes, path: ConvergencePath, marker: str, colour: str) -> None:
-    size = np.abs(path.bias)
+def _draw_path(
+    axes: Axes, path: ConvergencePath, measured: tuple[np.ndarray, np.ndarray], marker: str, colour: str
+) -> None:
+    power, error = measured
+    size = np.abs(power)
     axes.plot(path.steps, size, color=colour, linewidth=0.8)
     # Bars that reach below zero have no lower end on this scale.
-    reach = SIGMAS_95 * path.bias_error
+    reach = SIGMAS_95 * error
     lower = np.minimum(reach, 0.999 * size)
     for positive in (True, False):
-        chosen = (path.bias > 0) == positive
+        chosen = (power > 0) == positive
         axes.errorbar(
             path.steps[chosen],
             size[chosen],
@@ -107,7 +104,6 @@ def _draw_bias(axes: Axes, path: ConvergencePath, marker: str, colour: str) -> N
             elinewidth=0.7,
             label=path.solver if positive else None,
         )
-    axes.plot(path.steps, np.where(path.predicted > 0, path.predicted, np.nan), color=colour, linestyle="--")
 
 
 COLUMNS = ("solver", "steps", "bias", "bias error", "with EoR", "with EoR error", "predicted")
@@ -115,6 +111,8 @@ COLUMNS = ("solver", "steps", "bias", "bias error", "with EoR", "with EoR error"
 
 class Convergence(StudyFigure):
     """The bias of the residual power against the steps of several solvers, with convergence.csv."""
+
+    version: ClassVar[int] = 2
 
     kind: str = "convergence"
 

@@ -34,7 +34,7 @@ ACROSS = 3
 
 @style.journal_style()
 def draw_gain_coverage(members: Mapping[str, Covered]) -> Figure:
-    """Draw observed against expected fractions, and below it their difference with what chance allows, 95 %.
+    """Draw observed against expected fractions, and below it their difference with 1.96 standard errors.
 
     A pair of panels for each member, by name; the name of a single run is empty.
     """
@@ -81,7 +81,7 @@ def _draw_difference(axes: Axes, member: Covered) -> None:
     for place, (colour, observed) in enumerate(zip(COLOURS, member.observed, strict=True)):
         axes.plot(member.expected, 100 * (observed - member.expected), color=colour)
         chance = 100 * SIGMAS_95 * member.error[place]
-        label = "chance, 95 %" if place == 0 else None
+        label = "chance, 1.96 σ" if place == 0 else None
         axes.fill_between(member.expected, -chance, chance, color=style.BAND, linewidth=0, zorder=0, label=label)
     for place, (fraction, allowed) in enumerate(ALLOWED):
         label = "within 3 % at 68 %, 2 % at 95 %" if place == 0 else None
@@ -102,7 +102,7 @@ class GainCoverageFigure(StudyFigure):
     of = ("experiment", "collection")
     caption = (
         "Fractions of amplitudes and phases of the gains that are within limits of the true ones, against those of a "
-        "normal distribution with their errors; the difference; and what chance allows, 95 %, by the scatter over "
+        "normal distribution with their errors; the difference; and 1.96 standard errors by the scatter over "
         "realizations of the noise."
     )
     needs_calibration = True

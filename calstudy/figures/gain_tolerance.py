@@ -114,7 +114,7 @@ def draw_gain_tolerance(
             _draw_kind(axes, members, band, number)
         for line in published:
             axes.axhline(100 * line.rms, color=style.GREY, linewidth=0.7, linestyle=":", zorder=0)
-        _scale(axes, [found.law for found in worlds.values()])
+        _scale(axes, list(worlds.values()))
         axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
     _name(published, panels[-1])
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB"
@@ -177,11 +177,12 @@ def _place(law: GainBias) -> float:
     return (law.length or WHITE * float(law.lengths[0])) / 1e6
 
 
-def _scale(axes: Axes, laws: Sequence[GainBias]) -> None:
+def _scale(axes: Axes, worlds: Sequence[Tolerated]) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(LOWEST, HIGHEST)
-    ticks = sorted({_place(law): law.length / 1e6 for law in laws}.items())
+    smallest = min(float(np.nanmin(100 * found.sigma, initial=HIGHEST)) for found in worlds)
+    axes.set_ylim(min(LOWEST, smallest / 2), HIGHEST)
+    ticks = sorted({_place(found.law): found.law.length / 1e6 for found in worlds}.items())
     axes.set_xticks([place for place, _ in ticks], [f"{length:g}" for _, length in ticks])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("correlation length (MHz)")
@@ -222,7 +223,7 @@ class GainTolerance(StudyFigure):
     """The rms of gain errors at which the bias is a tenth of the EoR, against their correlation in frequency."""
 
     # Published tolerances are settings since 2.
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     kind: str = "gain-tolerance"
     published: Annotated[tuple[PublishedTolerance, ...], Field(strict=False)] = Field(
         (), description="Tolerances to compare with, drawn as dotted lines."

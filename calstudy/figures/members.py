@@ -46,7 +46,8 @@ def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
     axes = figure.subplots()
     for place, member in enumerate(members.values()):
         # Points are side by side within a bin, because members limited by the same noise coincide.
-        k = member.k + (place / len(members) - 0.5) * 0.6 * np.diff(member.k).min()
+        width = np.diff(member.k).min() if member.k.size > 1 else 0.0
+        k = member.k + (place / len(members) - 0.5) * 0.6 * width
         size, error = np.abs(member.bias), SIGMAS_95 * member.bias_error
         # Where the error is not known, the point has no bar.
         seen, its = ~(size <= error), look(place)

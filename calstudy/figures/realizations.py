@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -100,10 +100,18 @@ def _draw_correlation(figure: Figure, axes: Axes, results: RegionResults, limits
     edges = pooled.bin_edges
     image = axes.pcolormesh(edges, edges, correlation, cmap=CORRELATION_COLOURS, vmin=-1, vmax=1, rasterized=True)
     axes.set_facecolor("0.85")
-    freedom = sum(len(places) - 1 for _, places in pooled.design.blocks)
+    chance = _freedom(pooled) ** -0.5
     axes.set(aspect="equal", xlim=limits, ylim=limits, xlabel=style.WAVENUMBER, ylabel=style.WAVENUMBER)
-    axes.set_title(rf"correlation of $T$ ($\pm{freedom**-0.5:.2f}$ by chance)", fontsize=style.SMALL_SIZE + 0.5)
+    axes.set_title(rf"correlation of $T$ ($\pm{chance:.2f}$ by chance)", fontsize=style.SMALL_SIZE + 0.5)
     figure.colorbar(image, ax=axes, shrink=0.8)
+
+
+def _freedom(pooled: PooledRegion) -> float:
+    """Return the degrees of freedom of the covariance of T, a sum over blocks (Satterthwaite); median over bins."""
+    variances = np.array([block.scatter**2 for block in pooled.blocks["transfer"]])
+    each = np.array([[len(places) - 1] for _, places in pooled.design.blocks])
+    freedom = np.sum(variances, axis=0) ** 2 / np.sum(variances**2 / each, axis=0)
+    return float(np.median(freedom[np.isfinite(freedom)]))
 
 
 def _draw_pulls(axes: Axes, results: RegionResults) -> None:
@@ -121,8 +129,11 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
     # Linear over the expected range of pulls; where most of the EoR is lost they are far below.
     axes.set_yscale("symlog", linthresh=3)
     bottom = min(-3.0, axes.get_ylim()[0])
-    axes.set_yticks([-10, -3, -2, -1, 0, 1, 2, 3], ["−10", "−3", "−2", "−1", "0", "1", "2", "3"])
-    axes.set(ylabel="pull: mean and scatter\n(linear to ±3)", ylim=(bottom, max(3.0, axes.get_ylim()[1])))
+    top = max(3.0, axes.get_ylim()[1])
+    decades = [sign * 10**power for sign in (-1, 1) for power in range(1, 9) if bottom <= sign * 10**power <= top]
+    ticks = [*range(-3, 4), *decades]
+    axes.set_yticks(ticks, [f"{tick}".replace("-", "−") for tick in ticks])
+    axes.set(ylabel="pull: mean and scatter\n(linear to ±3)", ylim=(bottom, top))
     _legend_above(axes, 1)
 
 
@@ -144,7 +155,7 @@ def _draw_coverage(axes: Axes, results: RegionResults) -> None:
 
 
 def _draw_corrected(axes: Axes, results: RegionResults) -> None:
-    """Draw P^R and P^R / T over the input: the mean, with its 95 % error by all that was drawn."""
+    """Draw P^R and P^R / T over the input: the mean, with 1.96 times its error by all that was drawn."""
     pooled = results.pooled
     powers = {"P^R": (pooled.values["ratio"] * results.eor, style.GREY, "o", -0.15)}
     if results.corrected is not None:
@@ -155,7 +166,7 @@ def _draw_corrected(axes: Axes, results: RegionResults) -> None:
         look: dict[str, Any] = {"fmt": marker, "color": colour, "label": f"${name}$ over input"}
         axes.errorbar(shifted(pooled, shift), mean, SIGMAS_95 * error, elinewidth=0.7, **look)
     axes.axhline(1, color=style.BLACK, linewidth=0.7, zorder=0)
-    axes.set(ylabel="mean over the input, 95 %", ylim=(0, max(1.35, axes.get_ylim()[1])))
+    axes.set(ylabel=r"mean over the input, $\pm 1.96\,\sigma$", ylim=(0, max(1.35, axes.get_ylim()[1])))
     _legend_above(axes, 1)
 
 
@@ -184,6 +195,8 @@ class _OfRealizations(StudyFigure):
 
 class Realizations(_OfRealizations):
     """Statistics of the realizations of an experiment: T, pulls, coverage, and the correlation between bins."""
+
+    version: ClassVar[int] = 2
 
     kind: str = "realizations"
 
@@ -235,7 +248,7 @@ CSV = "realizations-comparison.csv"
 
 @style.journal_style()
 def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_k: float = 1.0) -> Figure:
-    """Draw T of two arrays with the scatter of one realization, and the mean difference with its 95 % error.
+    """Draw T of two arrays with the scatter of one realization, and the mean difference with 1.96 times its error.
 
     `arrays` are two, by title, in the same bins; `difference` is T of the first less that of the second. The axis of k
     ends at `max_k`, h/Mpc.
@@ -249,7 +262,7 @@ def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_
     upper.legend(loc="lower right", title="bars: scatter of one realization", title_fontsize=style.SMALL_SIZE)
     lower.errorbar(pooled.k, difference.mean, SIGMAS_95 * difference.error, fmt="o", color=style.BLACK, elinewidth=0.7)
     lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
-    lower.set(xlabel=style.WAVENUMBER, ylabel=r"difference of $T$, 95 %")
+    lower.set(xlabel=style.WAVENUMBER, ylabel=r"difference of $T$, $\pm 1.96\,\sigma$")
     lower.set_xlim(0, min(max_k, float(pooled.bin_edges[-1])))
     return figure
 
@@ -257,13 +270,15 @@ def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_
 class RealizationsComparison(_OfRealizations):
     """T of two arrays over the same draws, and their difference, with realizations-comparison.csv."""
 
+    version: ClassVar[int] = 2
+
     kind: str = "realizations-comparison"
 
     of = ("collection",)
     titles = TWO_ARRAYS
     caption = (
         "Transfer function outside the wedge of two arrays, over the same draws of EoR, gains and noise: mean and "
-        "scatter of one realization, and the mean difference with 95 % bars that include all that was drawn."
+        "scatter of one realization, and the mean difference with bars of 1.96 standard errors of all that was drawn."
     )
     tolerances = ((".*", Measured("follows from the figures of the members")),)
 

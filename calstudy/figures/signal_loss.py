@@ -207,7 +207,11 @@ def draw_expected_loss(loss: ExpectedLoss, buffer: float = 100e-9) -> Figure:
         label=f"injected, free of the flux scale {measured.flux_scale:.3f}",
     )
     filled = np.isfinite(measured.transfer)
-    left.set(xlabel=style.WAVENUMBER, ylabel=TRANSFER, xlim=(0, min(measured.bin_edges[1:][filled].max(), 1.5)))
+    left.set(
+        xlabel=style.WAVENUMBER,
+        ylabel=TRANSFER,
+        xlim=(0, np.clip(measured.bin_edges[1:][filled].max(initial=0), 0.1, 1.5)),
+    )
     left.set_title(f"outside wedge + {1e9 * buffer:.0f} ns")
     left.legend(loc="lower right")
     _draw_lengths(right, loss)

@@ -136,7 +136,7 @@ def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> Figure:
         for axes, (name, found) in zip(row, calibrators.items(), strict=False):
             _draw_routes(axes, found)
             axes.set_title(f"{name}, {world}")
-        row[0].set_ylabel(r"$P\,/\,P^{S}$, 95 % bars")
+        row[0].set_ylabel(r"$P\,/\,P^{S}$, $\pm 1.96\,\sigma$")
     for axes in grid[-1]:
         axes.set_xlabel(style.WAVENUMBER)
     handles, labels = grid[0, 0].get_legend_handles_labels()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
-from calstudy.claims.roles import require_long_baselines, unsuitable
+from calstudy.claims.roles import require_expected_signal, require_long_baselines, unsuitable
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
 from calstudy.verdicts.statement import Source, Statement
 
@@ -36,6 +36,7 @@ DEAD = Source("Abstract", ("dead_dipoles",))
 )
 def bias_is_a_hundred_signals(run: Results) -> Finding:
     require_long_baselines(run, MODES[1])
+    require_expected_signal(run)
     return bias(run, *MODES)
 
 
@@ -47,12 +48,14 @@ def bias_is_a_hundred_signals(run: Results) -> Finding:
 )
 def bias_exceeds_expected_signal(run: Results) -> Finding:
     require_long_baselines(run, MODES[1])
+    require_expected_signal(run)
     return bias(run, *MODES)
 
 
 class Joseph2020(Paper):
     """Statements on dead dipoles."""
 
+    version: ClassVar[int] = 2
     citation = (
         "Joseph, R. C., et al. 2020, Calibration and 21-cm power spectrum estimation in the presence of antenna beam "
         "variations, arXiv:1911.13088"

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from calstudy.base.constants import SPEED_OF_LIGHT
+from calstudy.base.constants import SPEED_OF_LIGHT, UNEVEN
 
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
@@ -55,7 +55,7 @@ def delay_transform(visibilities: np.ndarray, frequencies: np.ndarray, taper: st
 def channel_width(frequencies: np.ndarray) -> float:
     """Return the spacing in Hz of `frequencies` (Nfreqs,); raise ValueError unless equally spaced and ascending."""
     steps = np.diff(frequencies)
-    if steps.size == 0 or steps[0] <= 0 or not np.allclose(steps, steps[0], rtol=1e-6):
+    if steps.size == 0 or steps.min() <= 0 or np.ptp(steps) > UNEVEN * steps.mean():
         raise ValueError("frequencies must be at least two equally spaced ascending channels")
     return float((frequencies[-1] - frequencies[0]) / steps.size)
 

@@ -13,10 +13,10 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.visibilities import polarization_names
-from calstudy.power.binned import independent_times
-from calstudy.power.delay import TAPERS
+from calstudy.power.binned import independent_times, make_bin_edges
+from calstudy.power.delay import TAPERS, channel_width, delays
 from calstudy.power.settings import ESTIMATORS, PowerSettings
-from calstudy.power.spectra import DelaySpectra, average_times
+from calstudy.power.spectra import DelaySpectra, average_times, bins_of_k, modes_of, outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -70,6 +70,27 @@ def require_antennas(settings: PowerSettings, numbers: np.ndarray, remedy: str) 
     if largest is not None and numbers.max() > largest:
         raise InputError(
             f"antenna number {numbers.max()} is too large for the estimator, allowed: 0 to {largest}; {remedy}"
+        )
+
+
+def require_modes(settings: PowerSettings, lengths: np.ndarray, frequencies: np.ndarray) -> None:
+    """Raise InputError if spherical spectra have no mode; baseline `lengths` are in m, channels in Hz."""
+    lengths = np.unique(lengths[lengths > 0])
+    found = delays(frequencies.size, channel_width(frequencies))
+    modes = modes_of(found, lengths, float(frequencies.mean()), settings)
+    outside = outside_wedge(modes, settings.wedge_buffer)
+    if not outside.any():
+        raise InputError(
+            f"power.wedge_buffer = {1e6 * settings.wedge_buffer:g} us: no mode is outside the wedge: the shortest "
+            f"baseline has {lengths[0]:.3g} m, and delays reach {1e6 * np.abs(found).max():.4g} us; give a smaller "
+            "one, or narrower channels"
+        )
+    edges = make_bin_edges(settings.bins)
+    if (bins_of_k(modes, edges, settings.wedge_buffer) < 0).all():
+        k = np.hypot(modes.k_perp[:, None], modes.k_parallel)[outside]
+        raise InputError(
+            f"power.bins: no mode outside the wedge is between {edges[0]:g} and {edges[-1]:g} h/Mpc; they are between "
+            f"{k.min():.3g} and {k.max():.3g} h/Mpc"
         )
 
 

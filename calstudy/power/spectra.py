@@ -173,6 +173,17 @@ class BaselineModes:
     k_parallel: np.ndarray
 
 
+def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
+    """Return the modes of baselines (lengths in m) at delays (s), for the centre of the band (Hz)."""
+    cosmology = make_cosmology(power.cosmology)
+    return BaselineModes(
+        length=lengths,
+        k_perp=k_perpendicular(cosmology, lengths, centre),
+        delay=delay,
+        k_parallel=k_parallel(cosmology, delay, centre),
+    )
+
+
 @dataclass(frozen=True)
 class CylindricalSpectrum:
     """A power spectrum in Nb bins of baseline length and Nd delays.

@@ -370,10 +370,12 @@ def _sum_present(values: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(values).all(axis=0), np.nan, np.nansum(values, axis=0))
 
 
-def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np.ndarray, np.ndarray]:
+def correct(spectrum: SphericalSpectrum, transfer: TransferFunction, reduced: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return P^R / T and its standard deviation, (Nk,) each, in the unit of the spectrum.
 
-    Errors of P^R and T are independent: (sigma / P)^2 adds. NaN where too little is left to be corrected, or where most
+    Errors of P^R and T are independent. Those of P^R are divided by T if they are `reduced` like P^R, as errors of
+    what is left in measured data. Those of simulations are of all noise and EoR, of which the calibration takes as much
+    as of the signal: dividing P^R by T restores both. NaN where too little is left to be corrected, or where most
     of it is not the EoR at this k (`correctable`). Raise ValueError if the bins differ.
     """
     if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
@@ -383,8 +385,8 @@ def correct(spectrum: SphericalSpectrum, transfer: TransferFunction) -> tuple[np
     )
     factor = np.where(known, transfer.transfer, np.nan)
     power = spectrum.power.real / factor
-    error = np.hypot(spectrum.error, power * transfer.transfer_error) / factor
-    return power, error
+    own = spectrum.error / factor if reduced else np.where(known, spectrum.error, np.nan)
+    return power, np.hypot(own, power * transfer.transfer_error / factor)
 
 
 @dataclass(frozen=True)

@@ -119,10 +119,11 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=10):
+class Comparison(Task, stage="comparison", version=11):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
 
-    The table has C beside T since version 9, and verdicts the linear response where it is lower since 10.
+    The table has C beside T since version 9, and verdicts the linear response where it is lower since 10. Advice says
+    that no bias is seen only where none is since 11.
     """
 
     title: str
@@ -241,12 +242,13 @@ def _markdown(
         "of the EoR, both free of the flux scale s, outside the wedge, in bands of k in h/Mpc, with one standard "
         "deviation. Where T differs from them by more than its error, it has beside it C, the coefficient of the "
         "regression of the response on the EoR, which equals T at the minimum of a fit of free foregrounds and is "
-        "larger with a finite prior, and *linear*, T of the linear response of the fit. The gain error is the median "
-        "over antennas and integrations of the rms over channels, free of what no fit can know, and as fitted. χ² is "
-        "per sample of data that were not fitted, in units of the noise. The processor time of an integration, all "
-        "polarizations and threads together, is the median over solves, so that compilation in the first does not "
-        "decide. The memory is the largest resident memory of the process that solved, libraries and what earlier "
-        "work left included: an upper bound, but for programs that a calibrator starts (DP3), which are not in it.",
+        "larger with a finite prior, and *linear*, T of the linear response of the fit of the first polarization. "
+        "The gain error is the median over antennas and integrations of the rms over channels, free of what no fit "
+        "can know, and as fitted. χ² is per sample of data that were not fitted, in units of the noise. The "
+        "processor time of an integration, all polarizations and threads together, is the median over solves, so "
+        "that compilation in the first does not decide. The memory is the largest resident memory of the process "
+        "that solved, libraries and what earlier work left included: an upper bound, but for programs that a "
+        "calibrator starts (DP3), which are not in it.",
         "",
         "Calibrators see the same sky, gains and noise, so that a difference of two is known better than either: the "
         "errors of differences are found by leaving out the same antennas in both. The best in a band has the largest "
@@ -292,7 +294,8 @@ def _tolerances(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
     low, high = HEADLINE_BAND
     sentence = (
         f"Severity of each fault at which the bias reaches {LIMIT:g} of the EoR at k from {low:g} to {high:g} h/Mpc. "
-        "Between two severities it is taken for a power law; `noise`: it cannot be told from the noise."
+        "Between two severities it is taken for a power law, from the upper limit where the bias of the lower one is "
+        "not seen, so that it may be smaller than it is; `noise`: it cannot be told from the noise."
     )
     return ["## Tolerances", "", sentence, "", Table(("fault", *calibrators), rows).markdown()]
 

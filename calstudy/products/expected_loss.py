@@ -20,10 +20,9 @@ from calstudy.calibrate.settings import GainFit
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment, Variant
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.power.binned import make_bin_edges
-from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.score import BANDS
 from calstudy.power.settings import PowerSettings
-from calstudy.power.spectra import BaselineModes
+from calstudy.power.spectra import BaselineModes, modes_of
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import ExpectedBins, bin_expected, bin_response
 from calstudy.products import calibration, corruption
@@ -290,17 +289,6 @@ class LinearResponse(OfResponses, stage="linear-response", version=2, cost=Cost(
             ]
         write_json(output / RESPONSE, {"bands": bands})
         return {}
-
-
-def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: PowerSettings) -> BaselineModes:
-    """Return the modes of baselines (lengths in m) at delays (s), for the centre of the band (Hz)."""
-    cosmology = make_cosmology(power.cosmology)
-    return BaselineModes(
-        length=lengths,
-        k_perp=k_perpendicular(cosmology, lengths, centre),
-        delay=delay,
-        k_parallel=k_parallel(cosmology, delay, centre),
-    )
 
 
 def binned(expected: ExpectedTransfer, lengths: np.ndarray, centre: float, power: PowerSettings) -> ExpectedBins:

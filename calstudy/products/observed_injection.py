@@ -291,7 +291,7 @@ class ObservedTransfer(Injected, stage="observed-transfer", version=6, cost=Cost
             save_spectrum(output / spectrum_file("eor", modes), signals[modes])
             write_csv(output / f"eor.{modes}.csv", signals[modes])
         residual = load_spectrum(self.spectra / spectrum_file("residual", "outside-wedge"), SphericalSpectrum)
-        write_corrected(output, residual, signals["outside-wedge"])
+        write_corrected(output, residual, signals["outside-wedge"], reduced=True)
         return {"transfer": summary, "warnings": _not_measured(summary)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -56,6 +57,7 @@ def score(graph: Graph) -> MeasureScore | None:
     return MeasureScore(
         "score",
         power=graph.experiment.power,
+        polarizations=len(graph.experiment.instrument.polarizations),
         signal=loss.signal,
         response=loss.response,
         cross=loss.cross,
@@ -82,10 +84,14 @@ class ScoreTable(StudyTable):
         return [score(graph)]
 
 
-class MeasureScore(Task, stage="score", version=5):
-    """The scores in bins and in bands of k, and other numbers by which calibrators are compared."""
+class MeasureScore(Task, stage="score", version=6):
+    """The scores in bins and in bands of k, and other numbers by which calibrators are compared.
+
+    Errors of gains and chi^2 are of all polarizations since version 6.
+    """
 
     power: PowerSettings
+    polarizations: int
     signal: Input
     response: Input
     cross: Input
@@ -136,15 +142,18 @@ class MeasureScore(Task, stage="score", version=5):
         """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
         from calstudy.products.selection import read_gains, true_of
 
-        fitted = read_gains(self.calibration[PARITIES[0]])
-        true = true_of(self.gains, fitted)
-        solved = ~fitted.flags.all(axis=(1, 2))
-        if not solved.any():
-            return {"gain_error_aligned": None, "gain_error_as_fitted": None}
-        found, true = (np.where(fitted.flags, 0, gains)[solved] for gains in (fitted.values, true))
+        aligned, as_fitted = [], []
+        for place in range(self.polarizations):
+            fitted = read_gains(self.calibration[PARITIES[0]], place)
+            solved = ~fitted.flags.all(axis=(1, 2))
+            if solved.any():
+                both = (fitted.values, true_of(self.gains, fitted, place))
+                found, true = (np.where(fitted.flags, 0, gains)[solved] for gains in both)
+                aligned.append(np.ravel(gain_errors(aligned_gains(found, true), true)))
+                as_fitted.append(np.ravel(gain_errors(found, true)))
         return {
-            "gain_error_aligned": float(np.median(gain_errors(aligned_gains(found, true), true))),
-            "gain_error_as_fitted": float(np.median(gain_errors(found, true))),
+            "gain_error_aligned": float(np.median(np.concatenate(aligned))) if aligned else None,
+            "gain_error_as_fitted": float(np.median(np.concatenate(as_fitted))) if as_fitted else None,
         }
 
     def _held_out_chi_squared(self) -> float | None:
@@ -155,23 +164,22 @@ class MeasureScore(Task, stage="score", version=5):
         """
         from calstudy.products.selection import read_gains
 
-        fitted = read_gains(self.calibration[PARITIES[0]])
+        fitted = [read_gains(self.calibration[PARITIES[0]], place) for place in range(self.polarizations)]
         paths = [self.data[parity] / DATA for parity in PARITIES]
         paths.append(self.calibration[PARITIES[0]] / MODEL)
         misfit = noise = 0.0
         for part, (even, odd, model) in read_in_parts(paths, SAMPLES_AT_A_TIME):
             rows = rows_of(even, antenna_pairs(model))
-            first, second = np.searchsorted(fitted.numbers, antenna_pairs(model)).T
-            cubes = [to_cube(uvd)[..., 0] for uvd in (even, odd, model)]
-            flags = flag_cube(even)[..., 0] | flag_cube(odd)[..., 0]
-            unsolved = flag_cube(model)[..., 0]
-            for place, time in enumerate(part):
-                gains = fitted.values[time]
-                lacking = fitted.flags[time][first] | fitted.flags[time][second]
-                used = ~(flags[place][rows] | unsolved[place] | lacking)
-                predicted = gains[first] * gains[second].conj() * cubes[2][place]
-                misfit += float(np.sum(np.abs(cubes[1][place][rows] - predicted)[used] ** 2))
-                noise += float(np.sum(np.abs(cubes[1][place][rows] - cubes[0][place][rows])[used] ** 2)) / 2
+            first, second = np.searchsorted(fitted[0].numbers, antenna_pairs(model)).T
+            cubes = [to_cube(uvd) for uvd in (even, odd, model)]
+            flags, unsolved = flag_cube(even) | flag_cube(odd), flag_cube(model)
+            for (place, time), (pol, fit) in itertools.product(enumerate(part), enumerate(fitted)):
+                at, gains = (place, ..., pol), fit.values[time]
+                lacking = fit.flags[time][first] | fit.flags[time][second]
+                used = ~(flags[at][rows] | unsolved[at] | lacking)
+                predicted = gains[first] * gains[second].conj() * cubes[2][at]
+                misfit += float(np.sum(np.abs(cubes[1][at][rows] - predicted)[used] ** 2))
+                noise += float(np.sum(np.abs(cubes[1][at][rows] - cubes[0][at][rows])[used] ** 2)) / 2
         return misfit / noise if noise > 0 else None
 
     def _solves(self) -> dict[str, Any]:

@@ -182,8 +182,11 @@ class Injected(Task):
         return [Table(columns, rows, "Signal loss", NOTE)]
 
 
-class Transfer(Injected, stage="transfer", version=6, cost=Cost(1, disk=1e6)):
-    """T per k outside and inside the wedge and per (|b|, tau); equal lengths |b| share a bin since version 5."""
+class Transfer(Injected, stage="transfer", version=7, cost=Cost(1, disk=1e6)):
+    """T per k outside and inside the wedge and per (|b|, tau).
+
+    Equal lengths |b| share a bin since version 5; errors of P^R / T are not those of P^R over T since 7.
+    """
 
     scale: Input
 
@@ -192,7 +195,8 @@ class Transfer(Injected, stage="transfer", version=6, cost=Cost(1, disk=1e6)):
         known = read_json(self.scale / SCALE)["flux_scale"]
         scale = math.nan if known is None else known
         summary = write_transfer(output, self.read(), self.power, scale)
-        write_corrected(output, *spectra.read_recovered(self.spectra))
+        residual, signal = spectra.read_recovered(self.spectra)
+        write_corrected(output, residual, signal, reduced=False)
         return {"transfer": summary, "flux_scale": _json(scale)}
 
 
@@ -332,13 +336,13 @@ def _json(value: float) -> float | None:
     return round(float(value), 4) if math.isfinite(value) else None
 
 
-def write_corrected(folder: Path, residual: SphericalSpectrum, signal: SphericalSpectrum) -> None:
+def write_corrected(folder: Path, residual: SphericalSpectrum, signal: SphericalSpectrum, reduced: bool) -> None:
     """Write the power of the residual (with errors) outside the wedge, and the same divided by T.
 
-    T is read from `folder`, as written by `write_transfer`.
+    T is read from `folder`, as written by `write_transfer`; `reduced` is as in `calstudy.power.transfer.correct`.
     """
     found = load_spectrum(folder / spectrum_file(TRANSFER, "outside-wedge"), TransferFunction)
-    power, error = correct(residual, found)
+    power, error = correct(residual, found, reduced)
     unit = "[mK2 h-3 Mpc3]"
     write_columns(
         folder / "residual-corrected.outside-wedge.csv",

@@ -53,6 +53,8 @@ def faults(worlds: Sequence[str]) -> list[Fault]:
             entries.append((_converted(float(number.group()), unit, wanted, world), world, wanted))
     result = []
     for name, entries in found.items():
+        if all(severity == 0 for severity, *_ in entries):
+            continue
         own_zero = any(severity == 0 for severity, *_ in entries)
         ordered = sorted(entries if own_zero else [*without, *entries])
         severities, labels, _ = zip(*ordered, strict=True)

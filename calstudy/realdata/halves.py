@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.base.constants import SECONDS_PER_DAY, SIDEREAL_DAY
+from calstudy.base.constants import SECONDS_PER_DAY, SIDEREAL_DAY, UNEVEN
 from calstudy.base.errors import InputError
 from calstudy.base.feeds import X_IN_FILE, direction_of_x, rename_feeds
 from calstudy.base.observation import Frame
@@ -227,7 +227,7 @@ def _require_even(frequencies: np.ndarray) -> None:
             f"observed.select: {frequencies.size} channels are left; power spectra need at least {LEAST_CHANNELS}"
         )
     steps = np.diff(frequencies)
-    if np.ptp(steps) > 1e-3 * steps.mean():
+    if np.ptp(steps) > UNEVEN * steps.mean():
         place = frequencies[int(np.argmax(steps))]
         raise InputError(
             f"observed.data: the channels are {steps.min() / 1e3:.6g} to {steps.max() / 1e3:.6g} kHz apart, the "

@@ -64,8 +64,8 @@ class Signal:
 
     @property
     def excess(self) -> str | None:
-        """A warning if the bias exceeds the EoR by more than the noise explains; else None."""
-        if not abs(self.bias) - SIGMAS * self.bias_error > 1:
+        """A warning if the bias exceeds the EoR by more than the noise explains, or by an unknown error; else None."""
+        if not abs(self.bias) - SIGMAS * np.nan_to_num(self.bias_error) > 1:
             return None
         return (
             f"{PLACE}, the residual without EoR has {two_digits(abs(self.bias))} times the power of the EoR: "

@@ -229,10 +229,7 @@ def _dataset(
     fields = {item.name: item for item in dataclasses.fields(spectrum)}  # type: ignore[arg-type]
     edges = fields["bin_edges"].metadata["unit"]
     units = {name: fields[name].metadata["unit"] if name in fields else edges for name in arrays}
-    variables = {
-        name: xarray.Variable(dims, values, {"units": units[name]} if units[name] else {})
-        for name, (dims, values) in arrays.items()
-    }
+    variables = {name: xarray.Variable(dims, values, {"units": units[name]}) for name, (dims, values) in arrays.items()}
     single = {name: getattr(spectrum, name) for name in fields if name not in arrays and name != "bin_edges"}
     return xarray.Dataset(
         {name: value for name, value in variables.items() if name not in coordinates},
@@ -350,7 +347,9 @@ class RunFolder:
     def tables(self) -> Tables:
         """The tables of the run; raises InputError if there are none."""
         if not (self.path / "tables").is_dir():
-            raise InputError(f"{self.path}: has no tables; run the experiment again")
+            collected = self.manifest.get("members") if (self.path / MANIFEST).is_file() else None
+            remedy = "give the folder of one of its members" if collected else "run the experiment again"
+            raise InputError(f"{self.path}: has no tables; {remedy}")
         return Tables((self.path / "tables",))
 
     @property

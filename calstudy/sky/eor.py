@@ -12,7 +12,7 @@ from astropy.cosmology import FLRW, Planck15
 from pyradiosky import SkyModel
 from scipy.interpolate import CubicSpline
 
-from calstudy.base.constants import HYDROGEN_LINE
+from calstudy.base.constants import HYDROGEN_LINE, UNEVEN
 from calstudy.base.errors import InputError
 from calstudy.sky.boxes import box_power
 from calstudy.sky.settings import Eor
@@ -42,7 +42,7 @@ class EorField:
     def __init__(self, settings: Eor, frequencies: np.ndarray, cosmology: FLRW = Planck15) -> None:
         frequencies = np.asarray(frequencies, dtype=float)
         spacing = np.diff(frequencies)
-        if not len(spacing) or spacing.min() <= 0 or np.ptp(spacing) > 1e-6 * spacing.mean():
+        if not len(spacing) or spacing.min() <= 0 or np.ptp(spacing) > UNEVEN * spacing.mean():
             raise ValueError("frequencies: an EoR field needs at least two channels, equally spaced and increasing")
         self.settings, self._hubble = settings, float(cosmology.h)
         self.frequencies = frequencies

@@ -22,7 +22,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.instrument.interface import model_of
 from calstudy.instrument.layouts import Layout, make_array, make_layout, size_of_instrument
 from calstudy.instrument.settings import Channels, InstrumentSettings, nominal_beams
-from calstudy.power.interface import require_antennas
+from calstudy.power.interface import require_antennas, require_modes
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
@@ -49,6 +49,8 @@ def require_possible(experiment: Experiment) -> None:
     require_usable(experiment.corruption.effects, size_of_instrument(experiment.instrument))
     numbers = make_array(experiment.instrument).numbers
     require_antennas(experiment.power, numbers, "give other numbers in instrument.layout.path")
+    frame = frame_of(experiment.instrument)
+    require_modes(experiment.power, frame.lengths, frame.frequencies)
     require_calibration(experiment)
 
 

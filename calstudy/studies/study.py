@@ -17,6 +17,8 @@ from rich.console import Console
 
 from calstudy.base.errors import InputError
 from calstudy.base.files import digest_json
+from calstudy.base.identity import identity
+from calstudy.base.paths import texts
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
 from calstudy.base.table import to_json
@@ -147,8 +149,12 @@ class Study(ABC):
     @cached_property
     def folder(self) -> Path:
         """The run folder: the same study has the same one, and a changed study never overwrites it."""
-        runs = self.outputs.runs.expanduser().resolve()
-        return runs / f"{self.name}-{digest_json(self.content)[:8]}"
+        runs, content = self.outputs.runs.expanduser().resolve(), self.content
+        # Assumed values and those of a sweep are texts, of which some name files.
+        # For a text that is too long to be a path, Path.exists raises OSError.
+        paths = [text for text in texts(content) if text.startswith("/") and os.path.exists(text)]  # noqa: PTH110
+        named = {path: identity(Path(path)) for path in paths}
+        return runs / f"{self.name}-{digest_json([content, named] if named else content)[:8]}"
 
     @abstractmethod
     def sized_to(self, budget: Budget) -> tuple[Self, int]:

@@ -149,8 +149,8 @@ def _products(step: Step, experiment: Experiment) -> list[Task]:
 
 
 def passed(verdicts: Sequence[Verdict]) -> bool:
-    """Return true if every limit holds; a number that was not measured does not."""
-    return all(verdict.verdict == "PASS" for verdict in verdicts)
+    """Return true if there are limits and every one holds; a number that was not measured does not."""
+    return bool(verdicts) and all(verdict.verdict == "PASS" for verdict in verdicts)
 
 
 def tally(verdicts: Sequence[Verdict]) -> str:

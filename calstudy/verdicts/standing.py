@@ -287,11 +287,9 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
     if passed:
         first, *others = passed
         parts, least = [f"take {first.calibrator} ({first.numbers})"], first.transfer + MORE
-        largest = first.decisive[0]
-        seen = abs(largest.bias) > SIGMAS * largest.bias_error
-        parts.append(
-            f"its bias is largest in {largest.world} ({two_digits(largest.bias)})" if seen else "no bias is seen"
-        )
+        # A smaller bias may be known so much better that it alone is seen.
+        seen = next((found for found in first.decisive if abs(found.bias) > SIGMAS * found.bias_error), None)
+        parts.append(f"its bias is largest in {seen.world} ({two_digits(seen.bias)})" if seen else "no bias is seen")
         parts += [f"others that pass: {_listed(others)}"] if others else []
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]

@@ -23,7 +23,8 @@ OUTCOMES = ("supported", "contradicted", "mixed", "undecided", "not evaluated")
 def outcomes_of_sentences(verdicts: Iterable[Verdict]) -> dict[str, str]:
     """Return the outcome of each sentence by its id, without statements on the simulation alone.
 
-    It is that of its evaluated statements, and "mixed" if these differ.
+    It is that of its evaluated statements. Supported statements beside undecided ones leave it undecided; it is "mixed"
+    if some are contradicted and others are not.
     """
     found: dict[str, set[str]] = {}
     for verdict in verdicts:
@@ -34,6 +35,8 @@ def outcomes_of_sentences(verdicts: Iterable[Verdict]) -> dict[str, str]:
 
 def _together(outcomes: set[str]) -> str:
     evaluated = outcomes - {"not evaluated"}
+    if evaluated == {"supported", "undecided"}:
+        return "undecided"
     return "mixed" if len(evaluated) > 1 else next(iter(evaluated or outcomes))
 
 

@@ -262,6 +262,17 @@ def test_errors_of_realizations_have_a_distribution_of_their_own_and_few_tell_no
         assert "chi-squared" not in (tmp_path / "out" / "gain-comparison.json").read_text()
 
 
+def test_chi_squared_does_not_depend_on_the_level_of_the_gains(template, gains):
+    """Errors are of amplitudes, in the unit of the gains, and of phases."""
+    other = gains * (1 + 0.01 * complex_normal(np.random.default_rng(10), gains.shape))
+    found = []
+    for level in (1.0, 30.0):
+        cals = [make_uvcal(template, level * values) for values in (gains, other)]
+        size = np.full(gains.shape, 0.01)
+        found.append(compare_gains(pair_gains(*cals, errors=(ErrorsOfFile(level * size, size, 0.0),) * 2)).chi_squared)
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+
+
 def test_without_common_errors_there_is_no_chi_squared(template, gains):
     cals = [make_uvcal(template, gains), make_uvcal(template, 1.01 * gains)]
     errors = [ErrorsOfFile(np.full(gains.shape, 0.01), np.full(gains.shape, 0.01), 0.0) for _ in cals]

@@ -18,7 +18,7 @@ from calstudy.studies.load import load_study
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 NAMES = ("barry2016", "byrne2019", "byrne2023", "joseph2020", "chokshi2024")
-SIGNAL, SCALE = 200.0, 0.8
+SIGNAL, SCALE = 20_000.0, 0.8
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +49,13 @@ def long_array():
     return hexagon("instrument.layout={kind: mwa-compact, count: 56}")
 
 
-def run(fraction=0.0, error=0.0, leftover=0.0, product=1e-3, name="run", experiment=None, sky_model_error=0.1):
+def run(
+    fraction=0.0, error=0.0, leftover=0.0, product=1e-3, name="run", experiment=None, sky_model_error=0.1, signal=SIGNAL
+):
     """A run whose residual has parts of the power of the EoR: itself, its noise, and the error of what is left."""
     spectra = {
-        "eor": spectrum(SIGNAL),
-        "residual_without_eor": spectrum(fraction * SIGNAL / SCALE**2, error * SIGNAL / SCALE**2),
+        "eor": spectrum(signal),
+        "residual_without_eor": spectrum(fraction * signal / SCALE**2, error * signal / SCALE**2),
     }
     return SimpleNamespace(
         name=name,
@@ -262,6 +264,16 @@ def test_long_baselines_that_gains_are_not_fitted_to_do_not_count():
     cut = hexagon(long, "calibration={calibrator: sky-based, baselines: {longest: 100 m}}")
     reason = evaluated("barry2016", incomplete_sky_model=run(50, experiment=cut))[0].reason
     assert "longest baseline that gains are fitted to has" in reason
+
+
+@pytest.mark.parametrize("factor", [1e-2, 1e2])
+def test_an_eor_of_any_level_is_not_the_expected_signal(factor):
+    """20,000 mK^2 h^-3 Mpc^3 are Delta^2 = 27 mK^2 at k = 0.3 h/Mpc; 10 dB of the level are a factor of a hundred."""
+    other = run(100, signal=factor * SIGNAL)
+    for name, roles in (("joseph2020", ("dead_dipoles",)), ("chokshi2024", ("one_beam", "all_beams"))):
+        found = evaluated(name, **dict.fromkeys(roles, other))
+        assert [verdict.verdict for verdict in found] == ["not evaluated", "not evaluated"]
+        assert "the sentence is on the expected signal, 2 to 200: choose another" in found[0].reason
 
 
 def test_an_unrealistic_catalogue_decides_nothing():

@@ -16,7 +16,7 @@ from calstudy.base.visibilities import antenna_pairs, to_cube
 from calstudy.calibrate.settings import AutoWeights
 from calstudy.calibrate.weights import make_weights
 from calstudy.corrupt.levels import Levels, radiometer_std
-from calstudy.corrupt.noise import SystemTemperature, effective_area, thermal_noise
+from calstudy.corrupt.noise import SystemTemperature, autocorrelations, effective_area, thermal_noise
 from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import Variant
@@ -89,6 +89,12 @@ def test_a_spectrum_of_noise_has_its_level_in_every_channel():
     std = np.array([[1.0], [4.0], [9.0]])
     noise = thermal_noise((4000, 5, 3, 1), std, seed=1)
     assert np.std(noise, axis=(0, 1)) == pytest.approx(std, rel=0.02)
+
+
+def test_noise_of_autocorrelations_is_independent_of_that_of_cross_correlations_of_the_same_seed():
+    autos, noise = autocorrelations((10_000,), 1.0, 100.0, seed=7), thermal_noise((10_000,), 1.0, seed=7)
+    # Correlations of 10,000 independent pairs of numbers scatter by 0.01.
+    assert np.corrcoef([autos, noise.real, noise.imag])[0, 1:] == pytest.approx(np.zeros(2), abs=0.04)
 
 
 @pytest.mark.chain

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from flat_scores import case
 
-from calstudy.figures.comparison import CROSS, VARIANT_COLOURS, draw_variants, variants
+from calstudy.figures.comparison import CROSS, VARIANT_COLOURS, draw_spectra, draw_variants, variants
 from calstudy.plotting import style
 from calstudy.verdicts.standing import upper_limit
 
@@ -82,6 +82,19 @@ def test_symbols_of_worlds_are_those_of_the_legend_and_none_is_left_out():
     }
     drawn = [line.get_marker() for line in figure.axes[2].lines if line.get_linestyle() == "None"]
     assert drawn == 6 * [legend[f"{size} cm"].get_marker() for size in (2, 5, 10, 20, 50, 100)]
+
+
+@pytest.mark.parametrize("bias", [0.004, 2e-5])
+def test_a_small_bias_is_within_the_axis(bias):
+    small = with_status(case(bias=bias, bias_error=bias / 8), converged=4)
+    figure = draw_variants({"one, white": {"fit": small}}, ["fit"])
+    low, high = figure.axes[0].get_xlim()
+    assert low < bias < high
+
+
+def test_a_world_in_which_all_calibrators_refuse_is_an_empty_row():
+    figure = draw_spectra({"refused": {}, "one": {"fit": case()}}, ["fit"])
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["refused", "", "one", ""]
 
 
 def test_each_kind_of_world_has_the_calibrators_that_worked_there(figure):

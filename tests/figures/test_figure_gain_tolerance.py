@@ -66,6 +66,14 @@ def test_points_of_the_measurement_stand_beside_the_lines_of_the_law():
     assert any(np.allclose(line, 100 * worlds["1 MHz"].sigma[0]) for line in drawn if len(line) == 1)
 
 
+def test_what_a_faint_eor_tolerates_is_within_the_axis():
+    faint = tolerated(replace(LAW, bias=1e6 * LAW.bias, terms=1e6 * LAW.terms), 1e6 * BIAS, np.full(3, 0.04))
+    for axes in draw_gain_tolerance({"1 MHz": faint}, -60.0).axes:
+        low, high = axes.get_ylim()
+        assert low < 100 * faint.sigma.min()
+        assert high == 100
+
+
 def published(name="A", rms="1 %", source="a thesis", reason="the EoR"):
     return PublishedTolerance(name=name, rms=rms, source=source, reason=reason)
 

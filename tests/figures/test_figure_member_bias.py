@@ -35,6 +35,12 @@ def test_members_with_the_same_values_do_not_hide_each_other():
     assert np.all(np.abs(first - member.k) < 0.05)
 
 
+def test_members_with_a_single_bin_are_drawn():
+    member = MemberBias(np.array([0.1]), np.array([5.0]), np.array([1.0]))
+    [axes] = draw_member_bias({"one": member, "two": member}).axes
+    assert [container.lines[0].get_xdata().tolist() for container in axes.containers] == [[0.1], [0.1]]
+
+
 def test_a_figure_without_roles_has_all_members():
     study = load_study(EXPERIMENTS / "sky-errors.yaml")
     [figure] = study.figures

@@ -1,5 +1,7 @@
 """Figures of realizations show what was pooled."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from realization_samples import BINS, LOSS, design_of, draw
@@ -45,6 +47,30 @@ def test_the_figure_shows_mean_scatter_and_quoted_error_of_t(regions):
     expected = [outside.coverage("corrected_eor", np.arange(BINS) == place).value for place in range(BINS)]
     assert not np.allclose(expected, outside.covered["corrected_eor"].mean(axis=0))
     assert any(len(values) == BINS and np.allclose(values, expected) for values in shown)
+
+
+@pytest.mark.parametrize("dominant", [0, 1])
+def test_what_chance_makes_of_a_correlation_depends_on_the_block_that_scatters(regions, dominant):
+    """Of a block of K alone it is 1 / sqrt(K - 1): of ten draws, or of four."""
+    outside = regions["outside-wedge"]
+    blocks = [
+        replace(block, scatter=block.scatter * (1.0 if place == dominant else 1e-3))
+        for place, block in enumerate(outside.pooled.blocks["transfer"])
+    ]
+    pooled = replace(outside.pooled, blocks=outside.pooled.blocks | {"transfer": blocks})
+    shown = regions | {"outside-wedge": replace(outside, pooled=pooled)}
+    title = draw_realizations(shown, ["ten", "four"]).axes[2].get_title()
+    assert rf"\pm{(9, 3)[dominant] ** -0.5:.2f}$ by chance" in title
+
+
+def test_pulls_far_above_and_below_have_labels(regions):
+    outside = regions["outside-wedge"]
+    pulls = np.geomspace(60, 3000, BINS)
+    total = outside.pooled.total
+    moved = {name: replace(total[name], mean=sign * pulls) for name, sign in (("pull_eor", 1), ("pull_input", -1))}
+    shown = regions | {"outside-wedge": replace(outside, pooled=replace(outside.pooled, total=total | moved))}
+    ticks = draw_realizations(shown, ["ten", "four"]).axes[3].get_yticks()
+    assert {-1000, -100, -10, 0, 10, 100, 1000} <= set(ticks)
 
 
 def test_the_difference_of_two_arrays_is_known_better_than_that_of_independent_draws():

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from astropy.coordinates import AltAz, SkyCoord
 from astropy.time import Time
+from astropy.utils import iers
 
-from calstudy.base.visibilities import antenna_pairs, baseline_vectors, require_rectangular, subset_template
+from calstudy.base.errors import InputError
+from calstudy.base.visibilities import (
+    antenna_pairs,
+    baseline_vectors,
+    require_earth_orientation,
+    require_rectangular,
+    subset_template,
+)
 from calstudy.instrument.array_layouts.observatories import MwaLayout
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Channels, InstrumentSettings, Times
@@ -118,3 +126,14 @@ def test_writes_and_reads_back(tmp_path, template):
     back = type(uvd).from_file(tmp_path / "template.uvh5")
     assert back.telescope == template.telescope
     assert back.pol_convention == "sum"
+
+
+def test_times_are_known_up_to_the_end_of_the_installed_tables():
+    """Predictions are used, however old; a download is never tried."""
+    end = Time(iers.earth_orientation_table.get()["MJD"][-1], format="mjd").mjd
+    last, future = (Time(end + days, format="mjd") for days in (-1, 1))
+    require_earth_orientation(np.array([2457458.0, last.jd]), "data")
+    # Astropy raises an error for predictions that are older than it allows.
+    assert np.isfinite(last.get_delta_ut1_utc())
+    with pytest.raises(InputError, match=r"data: is of \d{4}-.* up to \d{4}-.*: update the package astropy-iers-data"):
+        require_earth_orientation(np.array([future.jd]), "data")

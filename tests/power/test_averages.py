@@ -21,16 +21,18 @@ from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import (
     CylindricalSpectrum,
     DelaySpectra,
+    SphericalSpectrum,
     delay_spectra,
     of_common_units,
     outside_wedge,
 )
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.power.transfer import Injection, bin_expected, cylindrical_transfer
+from calstudy.products.files import spectrum_file
 from calstudy.products.observed import WHAT
 from calstudy.products.observed_results import ObservedSpectra
 from calstudy.products.spectra import DELAY_SPECTRA
-from calstudy.realdata.noise import noise_of_average, noise_of_units
+from calstudy.realdata.noise import half_difference, noise_of_average, noise_of_units
 
 SETTINGS = PowerSettings(bins=KBins(max="2.0 h/Mpc", width="0.1 h/Mpc"))
 FREQUENCY, WIDTH, OMEGA_PP = 182e6, 80e3, 0.07
@@ -227,6 +229,20 @@ def test_noise_errors_equal_the_scatter(taper, n):
 
 
 @pytest.mark.parametrize("n", [1, 4])
+def test_noise_errors_of_units_that_differ_equal_the_scatter(n):
+    rng, n_delays, n_trials = np.random.default_rng(26), 16, 4000
+    noise = np.array([1.0, 1.5, 2.0, 2.5, 3.0])
+    shape = (n_trials, noise.size, n, n_delays)
+    even, odd = (np.sqrt(noise)[:, None, None] * white_delay_spectra(rng, shape, "none") for _ in range(2))
+    power = (even.conj() * odd)[:, :, 0] if n == 1 else cross_group(even, odd)
+    n_pairs = np.full(noise.size, 1 if n == 1 else n * (n - 1))
+    spectra = make_spectra(power[0], rng.normal(size=(noise.size, 3)) * 30, n_pairs, "none")
+    predicted = noise_error(spectra, np.zeros(power[0].shape, int), 1, noise)
+    # 4000 trials give the standard deviation to 1.1 %; the limit is four times that.
+    assert power.real.mean(axis=(1, 2)).std() == pytest.approx(predicted[0], rel=0.045)
+
+
+@pytest.mark.parametrize("n", [1, 4])
 def test_sample_variance_equals_the_scatter(n):
     """Signal only, the same in all baselines of a group: crossing more of them does not help."""
     rng, n_units, n_delays, n_trials = np.random.default_rng(22), 5, 48, 1500
@@ -412,6 +428,35 @@ def test_noise_of_an_average_is_that_of_the_samples_whose_variance_is_known(obse
     assert np.isnan(found[[2, 4]]).all()
 
 
+def test_noise_of_an_average_weighs_variances_by_the_squares_of_the_numbers_of_samples(observe, white):
+    data = white(observe(HexLayout(kind="hex", side=2), n_channels=8, n_times=2), np.random.default_rng(1))
+    shape = (2, data.Nbls, 8, 1)
+    counts, variance = (np.broadcast_to(np.reshape(two, (2, 1, 1, 1)), shape) for two in ((1.0, 3.0), (4.0, 1.0)))
+    data.nsample_array = counts.reshape(data.nsample_array.shape)
+    # Of (n + 3 n') / 4: (1 x 4 + 9 x 1) / 16.
+    np.testing.assert_allclose(noise_of_average(variance, data, np.arange(2)), np.sqrt(13 / 16))
+
+
+def test_the_difference_of_unequal_halves_has_the_power_of_the_noise_of_their_product(observe, white):
+    template, rng = observe(HexLayout(kind="hex", side=3), n_channels=64), np.random.default_rng(3)
+    even, odd = white(template, rng, sigma=1.0), white(template, rng, sigma=0.5)
+    odd.nsample_array[:] = 4.0
+    even.flag_array[1, 2] = odd.flag_array[3, 5] = True
+    odd.data_array[3, 5] = 1e6
+    found = half_difference(even, odd)
+    assert np.argwhere(found.flag_array)[:, :2].tolist() == [[1, 2], [3, 5]]
+    # sigma_E sigma_O, of 10,942 samples: known to 1 %, and the limit is four times that.
+    assert np.mean(np.abs(found.data_array[~found.flag_array]) ** 2) == pytest.approx(1.0 * 0.5, rel=0.04)
+
+
+def of_delays(delays, settings, folder):
+    """The task that averages delay spectra of measured data, by their names, from files in a folder."""
+    for name, spectra in delays.items():
+        (folder / name).mkdir()
+        save_spectrum(folder / name / DELAY_SPECTRA, spectra)
+    return ObservedSpectra("spectra", power=settings, delays={name: folder / name for name in delays})
+
+
 @pytest.mark.parametrize(("last", "first", "told"), [(10, 4, " ± "), (7, 6, " (error not known)"), (5, 5, "")])
 def test_noise_from_two_sources_is_compared_on_the_baselines_of_both(tmp_path, observe, white, beam, last, first, told):
     """Flagged autocorrelations leave baselines without noise from them."""
@@ -424,16 +469,29 @@ def test_noise_from_two_sources_is_compared_on_the_baselines_of_both(tmp_path, o
     known = {"difference": whole.of_units(np.arange(last)), "autos": whole.of_units(np.arange(first, 10))}
     delays = dict.fromkeys(WHAT, whole)
     delays |= {f"noise of {what} from {name}": one for what in ("data", "residual") for name, one in known.items()}
-    for name, spectra in delays.items():
-        (tmp_path / name).mkdir()
-        save_spectrum(tmp_path / name / DELAY_SPECTRA, spectra)
-    task = ObservedSpectra("spectra", power=settings, delays={name: tmp_path / name for name in delays})
+    task = of_delays(delays, settings, tmp_path)
     ratio = task.make(tmp_path)["noise"]["data"]["difference_over_autos"]
     assert (ratio is None) == (first >= last)
     (table,) = task.shown(tmp_path)
     # Powers of the same white data, outside the wedge and everywhere.
     assert ratio is None or ratio["mean"] == pytest.approx(1, abs=0.2)
     assert all(told in row[-1] and bool(told) == bool(row[-1]) for row in table.rows)
+
+
+def test_bars_of_data_as_given_are_of_their_own_noise_and_all_others_of_that_of_the_residual(
+    tmp_path, observe, white, beam
+):
+    settings = PowerSettings(pairs="same-baseline", wedge_buffer="0 ns")
+    template = observe(MwaLayout(kind="mwa-compact-minredundant", count=5), n_channels=64)
+    data = white(template, np.random.default_rng(4))
+    whole = delay_spectra(estimate_power(data, data, beam, settings), settings)
+    noise = {"data": dataclasses.replace(whole, power=9 * whole.power), "residual": whole}
+    delays = dict.fromkeys(WHAT, whole) | {f"noise of {name} from difference": one for name, one in noise.items()}
+    of_delays(delays, settings, tmp_path).make(tmp_path)
+    files = [tmp_path / spectrum_file(what, "outside-wedge") for what in WHAT]
+    bars = [load_spectrum(path, SphericalSpectrum).noise_error for path in files]
+    assert np.isfinite(bars[0]).sum() > 5
+    np.testing.assert_allclose(bars, [bars[0], bars[0] / 9, bars[0] / 9])
 
 
 def test_equal_lengths_share_a_bin_of_the_wedge(observe, white, beam):

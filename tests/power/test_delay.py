@@ -61,3 +61,10 @@ def test_bad_input_is_refused():
         d.delay_transform(np.zeros(8), 180e6 + 80e3 * np.arange(9), "none")
     with pytest.raises(ValueError, match="equally spaced"):
         d.delay_transform(np.zeros(3), np.array([1.0, 2.0, 4.0]), "none")
+
+
+@pytest.mark.parametrize("written", [np.round, np.float32])
+def test_frequencies_that_a_file_has_rounded_are_equally_spaced(written):
+    """As those of HERA, in whole Hz or in single precision."""
+    frequencies = 140e6 + 122_070.3125 * np.arange(64)
+    assert d.channel_width(written(frequencies)) == pytest.approx(122_070.3125, rel=1e-5)

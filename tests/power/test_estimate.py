@@ -268,6 +268,38 @@ def test_a_polarization_without_data_is_left_out(observe, white, beam):
     assert polarizations_without_data(even, odd) == []
 
 
+class WiderInY:
+    """A beam whose solid angles in yy are other multiples of those in xx."""
+
+    def __init__(self, beam):
+        self.beam = beam
+
+    def solid_angles(self, frequencies, pol):
+        linear, squared = self.beam.solid_angles(frequencies, pol)
+        return (linear, squared) if pol == "xx" else (2 * linear, 3 * squared)
+
+
+def test_each_polarization_has_the_solid_angles_of_its_own_beam(observe, white, beam):
+    """Temperatures go as 1 / Omega_p, and the normalization as Omega_p^2 / Omega_pp: together as 1 / Omega_pp."""
+    both = two(observe(GOLOMB, polarizations=("xx", "yy")), white)
+    found = estimate_power(*both, WiderInY(beam), PowerSettings()).data_array[0]
+    equal = estimate_power(*both, beam, PowerSettings()).data_array[0]
+    np.testing.assert_allclose(found, equal / [1, 3], rtol=1e-10)
+
+
+def test_a_baseline_without_odd_data_is_crossed_by_its_even_data_alone(observe, white, beam):
+    even, odd = two(observe(HexLayout(kind="hex", side=2), n_channels=8), white)
+    settings = PowerSettings(pairs="redundant-group")
+    pairs = make_pairs(even, settings)
+    whole = set(zip(pairs.first, pairs.second, strict=True))
+    lost = pairs.first[0]
+    odd.flag_array[(antenna_pairs(odd) == sorted(lost)).all(axis=1)] = True
+    found = estimate_power(even, odd, beam, settings)
+    kept = set(found.get_blpairs())
+    assert kept == {pair for pair in whole if pair[1] != lost}
+    assert lost in {first for first, _ in kept}
+
+
 def test_bad_data_are_refused(observe, white, beam):
     template = observe(GOLOMB)
     even, odd = two(template, white)

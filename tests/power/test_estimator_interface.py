@@ -11,7 +11,7 @@ from hera_pspec import UVPSpec
 
 from calstudy.base.errors import InputError
 from calstudy.instrument.array_layouts.geometric import GolombLayout
-from calstudy.power.interface import Estimator, estimate_spectra, require_antennas
+from calstudy.power.interface import Estimator, estimate_spectra, require_antennas, require_modes
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra, delay_spectra
 from calstudy.power.tables import load_spectrum, save_spectrum
@@ -35,6 +35,24 @@ def spoiled(changes) -> PowerSettings:
 def data(observe, white, rng):
     template = observe(GolombLayout(kind="golomb", count=3, spacing="14 m"))
     return white(template, rng), white(template, rng)
+
+
+LENGTHS = np.array([0.0, 3.0, 90.0])
+CHANNELS = 167e6 + 80e3 * np.arange(64)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"wedge_buffer": "6.3 us"}, r"power\.wedge_buffer = 6\.3 us: .* shortest baseline has 3 m, .* reach 6\.25 us"),
+        ({"bins": {"max": "0.01 h/Mpc", "width": "0.01 h/Mpc"}}, r"power\.bins: no mode .* between 0 and 0\.01 h/Mpc"),
+        ({"bins": {"min": "4 h/Mpc", "max": "5 h/Mpc"}}, r"power\.bins: .* are between 0\.\d+ and 3\.\d+ h/Mpc"),
+    ],
+)
+def test_settings_that_leave_no_mode_are_refused(changes, told):
+    require_modes(PowerSettings(wedge_buffer="5 us"), LENGTHS, CHANNELS)
+    with pytest.raises(InputError, match=told):
+        require_modes(PowerSettings(**changes), LENGTHS, CHANNELS)
 
 
 def test_delay_spectra_are_stored_with_units_and_read_without_hera_pspec(data, beam, tmp_path):

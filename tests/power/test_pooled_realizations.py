@@ -210,6 +210,25 @@ def test_corrected_power_is_the_input_on_average_and_its_intervals_cover(design,
     assert np.mean([sample.residual.power.real.mean() for sample in samples]) < 0.85 * INPUT
 
 
+def test_flux_scales_that_differ_leave_the_power_on_the_true_scale_as_it_is(random):
+    samples = draw(EVERYTHING, random)
+    scales = 1.1 + 0.05 * random.standard_normal(len(samples))
+    rescaled = []
+    for sample, scale in zip(samples, scales, strict=True):
+        residual, found = sample.residual, sample.transfer
+        transfer = replace(
+            found,
+            transfer=found.transfer / scale**2,
+            cross_transfer=found.cross_transfer / scale,
+            scale_free_transfer=found.transfer,
+            flux_scale=scale,
+        )
+        rescaled.append(replace(sample, residual=replace(residual, power=residual.power / scale**2), transfer=transfer))
+    power = correct_realizations(samples, EVERYTHING).power
+    assert np.isfinite(power).all()
+    assert correct_realizations(rescaled, EVERYTHING).power_known_scale == pytest.approx(power, rel=1e-9)
+
+
 def test_intervals_about_the_input_cover_it_with_few_modes(random):
     """Skies of twelve modes, no noise, T known: bars that follow the measured power cover in 91 per cent."""
     modes, count = 12.0, 8

@@ -71,6 +71,15 @@ def test_a_calibration_does_not_differ_from_itself():
     assert found.transfer == found.transfer_error == found.bias == found.bias_error == 0
 
 
+def test_scores_of_a_response_that_is_a_part_of_the_signal_are_this_part_on_the_true_flux_scale():
+    """An amplitude over the scale 1.1: T has the square of both, C each of them once."""
+    rng, part, scale = np.random.default_rng(4), 0.8, 1.1
+    signal, left = (complex_normal(rng, len(PAIRS), DELAYS) for _ in range(2))
+    one = calibrated(signal, np.full(ANTENNAS, np.sqrt(part / scale)), 0 * left)
+    found = score(one, EDGES, BUFFER, scale)
+    assert (found.cross_transfer, found.transfer) == (pytest.approx(part), pytest.approx(part**2))
+
+
 def test_a_difference_is_that_of_the_scores_free_of_either_flux_scale():
     pair, scales = of_draw(1, 0.5), (1.02, 0.97)
     alone = [score(one, EDGES, BUFFER, scale) for one, scale in zip(pair, scales, strict=True)]

@@ -173,6 +173,13 @@ def test_noise_that_both_residuals_share_cancels(template, rng, white):
     assert abs((powers[0] - powers[1]) / powers[2] - 0.25) > 0.1
 
 
+def test_a_sample_that_is_flagged_in_either_residual_is_flagged_in_the_response(template, rng, white):
+    with_signal, without = white(template, rng), white(template, rng)
+    with_signal.flag_array[1, 2] = without.flag_array[3, 4] = True
+    assert np.argwhere(signal_response(with_signal, without).flag_array[..., 0]).tolist() == [[1, 2], [3, 4]]
+    assert with_signal.flag_array[3, 4].sum() == without.flag_array[1, 2].sum() == 0
+
+
 def test_noise_that_is_left_in_the_response_scatters_but_gives_no_bias():
     pulls = []
     for seed in range(200):
@@ -234,6 +241,19 @@ def test_pooling_is_as_if_all_modes_were_of_one_injection(rng):
         pool([])
 
 
+def test_errors_of_pooled_injections_fall_by_the_square_root_of_their_number(rng):
+    signal = noise(rng)
+    injection = inject(signal, *(0.8 * signal + 0.7 * noise(rng) for _ in range(2)))
+    one = spherical_transfer(injection, ONE_BIN, BUFFER, inside=False, flux_scale=1.1)
+    four = pool(4 * [one])
+    for name in ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence"):
+        assert getattr(four, name) == pytest.approx(getattr(one, name))
+        assert getattr(four, f"{name}_error") == pytest.approx(getattr(one, f"{name}_error") / 2)
+    # An injection of three times the signal has three times the weight: (3^2 + 1) / 4^2.
+    loud = dataclasses.replace(one, signal=3 * one.signal)
+    assert pool([loud, one]).transfer_error == pytest.approx(np.sqrt(10) / 4 * one.transfer_error)
+
+
 def test_what_is_not_known_of_one_injection_is_that_of_the_others(rng):
     signals = [noise(rng) for _ in range(3)]
     injections = [inject(part, 0.8 * part, 0.8 * part) for part in signals]
@@ -263,12 +283,14 @@ def test_corrected_power_is_unbiased_with_both_errors_and_unknown_where_all_is_l
     transfer = TransferFunction(
         (edges[1:] + edges[:-1]) / 2, edges, kept, 0.01 * ones, kept, 0.01 * ones, *(6 * [ones]), 1.0
     )
-    power, error = correct(spectrum([50.0, 100.0, 1.0], 3.0, edges), transfer)
-    assert power[:2] == pytest.approx([100.0, 100.0])
-    assert error[:2] == pytest.approx([np.hypot(6.0, 2.0), np.hypot(3.0, 1.0)])
-    assert np.isnan([power[2], error[2]]).all()
+    # Errors of what is left grow with the correction; those of all that was put in are right for all that is restored.
+    for reduced, own in ((True, 6.0), (False, 3.0)):
+        power, error = correct(spectrum([50.0, 100.0, 1.0], 3.0, edges), transfer, reduced)
+        assert power[:2] == pytest.approx([100.0, 100.0])
+        assert error[:2] == pytest.approx([np.hypot(own, 2.0), np.hypot(3.0, 1.0)])
+        assert np.isnan([power[2], error[2]]).all()
     with pytest.raises(ValueError, match="different bins"):
-        correct(spectrum([1.0], 1.0, edges[:2]), transfer)
+        correct(spectrum([1.0], 1.0, edges[:2]), transfer, reduced=False)
 
 
 def low_delays_fitted(spectra: np.ndarray, weights: np.ndarray, edge: np.ndarray) -> np.ndarray:
@@ -303,7 +325,7 @@ def test_power_that_leaked_from_other_delays_is_not_taken_for_the_eor(rng):
     assert transfers["steep", True].transfer / found.transfer < 0.05
     for inside, expected in ((True, np.nan), (False, 100.0)):
         residual = 100.0 * transfers["steep", inside].transfer
-        power, error = correct(spectrum(residual, 1.0, np.array(ONE_BIN)), transfers["flat", inside])
+        power, error = correct(spectrum(residual, 1.0, np.array(ONE_BIN)), transfers["flat", inside], reduced=True)
         # The fit changes no delay beyond the wedge.
         assert power == pytest.approx([expected], nan_ok=True)
         assert np.isfinite(error) == np.isfinite(expected)
@@ -316,7 +338,7 @@ def test_a_leak_is_not_taken_for_the_eor_however_well_it_is_known():
         (edges[1:] + edges[:-1]) / 2, edges, 0.1 * ones, 1e-4 * ones, np.array([0.01, 0.09]), 1e-4 * ones,
         *(6 * [ones]), 1.0,
     )  # fmt: skip
-    power, error = correct(spectrum([10.0, 10.0], 1.0, edges), transfer)
+    power, error = correct(spectrum([10.0, 10.0], 1.0, edges), transfer, reduced=True)
     assert power == pytest.approx([np.nan, 100.0], nan_ok=True)
     assert np.isfinite(error).tolist() == [False, True]
 

@@ -20,6 +20,7 @@ def test_worlds_are_grouped_by_fault_and_ordered_by_severity():
 def test_a_severity_of_zero_of_its_own_takes_the_place_of_the_ideal_world():
     [found] = faults(["ideal", "drift: 0 %", "drift: 1 %"])
     assert (found.worlds, found.severities) == (("drift: 0 %", "drift: 1 %"), (0.0, 1.0))
+    assert faults(["ideal", "drift: 0 %"]) == []
 
 
 def test_levels_are_no_severities_and_hyphens_no_signs():

@@ -71,6 +71,8 @@ def test_noise_above_the_eor_is_no_excess(tmp_path):
     assert read_signal(finished_run(tmp_path, scores(4, bias_error=1.6))).excess is None
     # Leaving out antennas gives what is left of foregrounds an error of a quarter or more of it.
     assert read_signal(finished_run(tmp_path, scores(3.9e6, bias_error=1.1e6))).excess is not None
+    # An error that is not known explains nothing.
+    assert read_signal(finished_run(tmp_path, scores(5000, bias_error=np.nan))).excess is not None
 
 
 def test_a_run_without_scores_has_no_headline(tmp_path):

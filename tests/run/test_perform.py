@@ -237,6 +237,24 @@ def test_an_input_that_vanished_is_told_in_a_sentence(store):
         perform(WorkOrder.of(Number("second", number=2, needed={"first": first}), store))
 
 
+def flip_a_digit(store: Store, task: Task) -> None:
+    """Damage a product that keeps its size, as a disk does."""
+    path = store.folder("number", task.key) / "number"
+    path.write_text(str(9 - int(path.read_text())))
+
+
+def test_what_is_damaged_after_the_plan_is_read_by_nobody_and_made_again(store):
+    first = Number("first", number=1)
+    second = Number("second", number=2, needed={"first": first})
+    for task in (first, second):
+        perform(WorkOrder.of(task, store))
+    flip_a_digit(store, second)
+    assert (perform(WorkOrder.of(second, store)).path / "number").read_text() == "3"
+    flip_a_digit(store, first)
+    with pytest.raises(InputError, match=r"number \(third\): its input number/\w+ was removed or damaged"):
+        perform(WorkOrder.of(Number("third", number=3, needed={"first": first}), store))
+
+
 PROGRAM = """
 import os, resource, signal, sys
 from pathlib import Path

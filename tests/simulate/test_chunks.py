@@ -166,6 +166,17 @@ def test_the_check_finds_the_error_that_is_there(tolerance, template, sky, dipol
     assert set(check["times_jd"]) <= set(integration_times(template))
 
 
+def test_sources_that_are_not_up_when_it_is_checked_have_an_error(template, dipole_beam):
+    chunks = plan_chunks(template, accuracy(1e-6), 1)
+    cube = np.ones((template.Ntimes, template.Nbls, template.Nfreqs, template.Npols), complex)
+    check = check_interpolation(lambda part: np.zeros(_shape(part)), template, cube, chunks[0])
+    assert (check["max_error"], check["rms_error"]) == (1, 1)
+
+
+def _shape(part):
+    return part.Ntimes, part.Nbls, part.Nfreqs, part.Npols
+
+
 def test_nodes_serve_any_engine(dipole_beam):
     template = observe(count=3, channels=14, width="140 kHz", times=14, integration="8 s", polarizations=("xx",))
     sky = random_sky(template, count=12)

@@ -157,6 +157,7 @@ def test_channel_depth_is_the_derivative_of_distance():
 def test_channels_must_be_equally_spaced():
     with pytest.raises(ValueError, match="equally spaced"):
         EorField(Eor(), np.array([170e6, 171e6, 173e6]))
+    assert EorField(Eor(), np.round(140e6 + 122_070.3125 * np.arange(64))).n_pixels
 
 
 @pytest.mark.slow

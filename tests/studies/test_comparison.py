@@ -403,6 +403,26 @@ def test_relative_paths_start_at_the_file_that_names_them(tmp_path):
     assert load_study(path).cases[0].experiment.calibration.calibrator == str(own / "mine.py")
 
 
+def test_the_name_of_a_calibrator_is_none_of_a_folder(tmp_path):
+    (tmp_path / "redcal").mkdir()
+    names = {"mine": {"calibrator": "by-file", "folder": "redcal"}, "theirs": "redcal"}
+    study = load_study(comparison_file(tmp_path, calibrators=names))
+    again = read_back(study, tmp_path / "run")
+    labels = {case.calibrator: case.experiment.calibration.label for case in again.cases}
+    assert labels == {case.calibrator: case.experiment.calibration.label for case in study.cases}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("sweep", {"sky.eor.seed": [2, 3]}), ("realizations", {"draw": ["noise"], "count": 3})]
+)
+def test_an_experiment_with_more_than_one_run_is_refused(tmp_path, field, value):
+    path = comparison_file(tmp_path)
+    base = yaml.safe_load((tmp_path / "base.yaml").read_text())
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(base | {field: value}))
+    with pytest.raises(ExperimentError, match=f"^experiment: has {field}, which a comparison does not make"):
+        load_study(path)
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -191,12 +191,13 @@ def test_chi_squared_per_degree_of_freedom_is_one(one_file):
 
 
 def test_integrations_that_were_not_fitted_have_the_chi_squared_of_two_noises(one_file):
-    """That of the data, and half that of a fit; what the sky does not linearly in 10 s adds to it."""
+    """That of the data, and half that of a fit; what the sky does not linearly in 10 s adds less than the limit."""
     found = json.loads((one_file.folder / "tables" / "quality.json").read_text())
     for parity in ("even", "odd"):
         held = found[parity]["held_out"]
         assert held["samples"] == ANTENNAS * (ANTENNAS - 1) // 2 * CHANNELS * (TIMES // 2 - 1)
-        assert held["per_sample"] > held["expected"] - 5 / np.sqrt(held["samples"])
+        # Of noise with 1.3 times the variance, the mean scatters by 1.3 / sqrt(samples): the limit is four times that.
+        assert held["per_sample"] == pytest.approx(held["expected"], abs=5 / np.sqrt(held["samples"]))
 
 
 def test_the_transfer_function_is_that_of_the_simulation(simulated, one_file):

@@ -319,6 +319,10 @@ def test_the_file_reads_back_from_the_run_folder(finished):
             {"instrument__as_built__positions": {"scatter": "1 cm", "seed": 13}},
             "realizations: the seed 13 would be used for noise and for instrument.as_built.positions (seeds grow by 10",
         ),
+        (
+            {"sky__eor": {"nside": 32, "spectrum": "power-law", "seed": 1}, "sky__diffuse": {"kind": "synthetic"}},
+            "realizations: the seed 21 would be used for sky.diffuse and for the EoR (seeds grow by 10",
+        ),
         ({"outputs__figures": ["wedge", "gains"]}, "outputs.figures: are figures of single runs"),
         ({"sweep": {"sky.eor.seed": [2, 3]}}, "realizations: cannot be asked for together with a sweep"),
         (

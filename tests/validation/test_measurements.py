@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from ladders import load_ladder
 
 from calstudy.base.errors import InputError
-from calstudy.claims.bins import clustered_mean, pooled
+from calstudy.claims.bins import clustered_mean, mean_of_common_errors, pooled
 from calstudy.power.spectra import DelaySpectra
 from calstudy.validation.ladder import SCALES, passed, tally
 from calstudy.validation.steps.estimator import windowed
@@ -63,15 +61,18 @@ def test_a_window_mixes_delays_as_monte_carlo_does(taper, rng):
     np.testing.assert_allclose(found, expected, rtol=5 / np.sqrt(draws))
 
 
-@given(seed=st.integers(0, 2**32 - 1), n_units=st.integers(20, 60))
-@settings(max_examples=20, deadline=None)
-def test_clustered_errors_cover_the_truth(seed, n_units):
+@pytest.mark.parametrize("n_units", [20, 60])
+def test_clustered_errors_are_the_scatter_of_means_of_units(n_units):
     """Units whose modes share a common offset: the error must be that of the units, not of the modes."""
-    generator = np.random.default_rng(seed)
-    values = 5.0 + generator.standard_normal((n_units, 1)) + 0.01 * generator.standard_normal((n_units, 50))
-    found = clustered_mean(values)
-    assert abs(found.value - 5) < 6 * found.uncertainty
-    assert found.uncertainty == pytest.approx(n_units**-0.5, rel=0.6)
+    generator = np.random.default_rng(n_units)
+    offsets, own = (generator.standard_normal((200, n_units, modes)) for modes in (1, 50))
+    found = [clustered_mean(5.0 + one) for one in offsets + 0.01 * own]
+    values, errors = (np.array([getattr(one, name) for one in found]) for name in ("value", "uncertainty"))
+    # A variance from 19 degrees of freedom or more scatters by a third: the rms error of 200 is known to 1.1 %.
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(n_units**-0.5, rel=0.05)
+    # The scatter of 200 means is known to 5 %, their mean to 1 / sqrt(200).
+    assert values.std() == pytest.approx(n_units**-0.5, rel=0.2)
+    assert values.mean() == pytest.approx(5, abs=4 * (200 * n_units) ** -0.5)
 
 
 def test_left_out_modes_do_not_count():
@@ -83,6 +84,13 @@ def test_pooling_weights_by_inverse_variance():
     found = pooled([Finding(1.0, 1.0), Finding(2.0, 0.5)])
     assert found.value == pytest.approx((1 + 8) / 5)
     assert found.uncertainty == pytest.approx(5**-0.5)
+
+
+def test_errors_that_bins_have_in_common_do_not_average_down():
+    """All bins are off by two of their errors, and so is their mean."""
+    for errors in (np.full(9, 0.1), np.linspace(0.1, 0.3, 9)):
+        found = mean_of_common_errors(1 + 2 * errors, errors)
+        assert found.value == pytest.approx(1 + 2 * found.uncertainty)
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -137,6 +145,20 @@ def test_a_number_that_is_missing_or_not_finite_does_not_pass():
     assert [verdict.verdict for verdict in verdicts] == ["not evaluated", "PASS", "not evaluated"]
     assert not passed(verdicts)
     assert tally(verdicts) == "0 of 1 steps pass, 1 of 3 criteria"
+    assert not passed([])
+
+
+def test_a_chain_without_reflections_does_not_pass_because_nothing_is_left_of_them():
+    ((step, _),) = load_ladder(["3.0"]).steps
+    found = {name: {"value": value, "uncertainty": 0.5} for name, value in (("left", 0.1), ("artefact_sigmas", 0.2))}
+    assert not passed(step.judge(found))
+
+
+def test_fits_that_do_nothing_do_not_pass_because_all_are_alike():
+    ((step, _),) = load_ladder(["2.2"]).steps
+    values = {"false_convergence": 0, "floor": 1000.0, "paper_case": 1.0, "out_of_reach": 0}
+    verdicts = step.judge({name: {"value": float(value), "uncertainty": 0.0} for name, value in values.items()})
+    assert [verdict.name for verdict in verdicts if verdict.verdict == "FAIL"] == ["2.2 floor"]
 
 
 @pytest.mark.parametrize(

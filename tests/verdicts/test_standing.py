@@ -152,6 +152,12 @@ def test_the_answer_ranks_those_that_pass_by_t():
     assert math.isclose(found[0].upper_limit, 0.02)
 
 
+def test_a_small_bias_that_is_known_well_is_seen_beside_a_larger_one_that_may_be_noise():
+    scores = {"noisy": {"one": case(0.03, 0.02, 0.9)}, "quiet": {"one": case(0.025, 0.002, 0.9)}}
+    _, sentence = advice(standings(scores))
+    assert "its bias is largest in quiet (0.025)" in sentence
+
+
 def test_the_advice_names_what_breaks_a_calibrator_first_and_what_keeps_more_but_fails_in_few_worlds():
     scores = {
         "ideal": {"safe": case(0.0, 0.01, 0.4), "bold": case(0.0, 0.01, 0.7), "poor": case(5.0, 0.1, 0.9)},

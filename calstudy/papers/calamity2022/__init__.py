@@ -24,6 +24,8 @@ REDUNDANT_FROM = 0.5
 """Fraction of baselines with a redundant partner from which an array is redundant."""
 PAPER_WIDTH = 80e3
 """Width of a channel, Hz."""
+PAPER_BAND = 167e6, 198e6
+"""The paper's 384 channels begin and end within it, Hz."""
 EOR_LEVEL = -40.0
 """Level of the EoR relative to the foregrounds, dB of brightness."""
 NOISE_FACTORS = {"times-eor": 10.0, "times-foregrounds": 0.1}
@@ -34,6 +36,8 @@ LEAST_STEPS = 1000
 """First-order steps below which foregrounds are not fitted: the paper's solver takes thousands."""
 NOT_THE_METHOD = ("calibrator", "solver", "weights", "chunks", "models_at_once")
 """Fields of a calibrator whose defaults are not the paper's, or need not be."""
+NOT_THE_ESTIMATE = ("estimator", "pairs", "redundancy_tolerance", "length_bin", "bins")
+"""Fields of `power` that may differ: bins, and what makes the same spectra."""
 
 
 class Calamity2022(Paper):
@@ -92,7 +96,8 @@ class Calamity2022(Paper):
             _other_data,
             _other_sky,
             _too_few_steps,
-            _same_channels,
+            _other_channels,
+            _other_power,
         )
         study = _study(role)
         found = next((refusal for check in checks if (refusal := check(study, experiment)) is not None), None)
@@ -175,13 +180,25 @@ def _other_sky(role: str, experiment: Experiment) -> str | None:
     del role
     if experiment.sky.diffuse.kind != "none":
         return f"sky.diffuse is {experiment.sky.diffuse.kind!r}, and the paper's sky has sources alone"
-    return None
+    return _changed(experiment.sky.eor, "sky.eor", ("nside", "seed"))
 
 
-def _same_channels(role: str, experiment: Experiment) -> str | None:
-    if role == "other_channels" and experiment.instrument.channels.width == PAPER_WIDTH:
+def _other_channels(role: str, experiment: Experiment) -> str | None:
+    channels = experiment.instrument.channels
+    low, high = PAPER_BAND
+    if not low <= channels.band[0] < channels.band[1] <= high:
+        return f"instrument.channels has {channels.label}, not in the paper's {low / 1e6:g} to {high / 1e6:g} MHz"
+    if role == "other_channels" and channels.width == PAPER_WIDTH:
         return f"instrument.channels.width is the paper's, {PAPER_WIDTH / 1e3:g} kHz"
     return None
+
+
+def _other_power(role: str, experiment: Experiment) -> str | None:
+    if role == "minimally_redundant" and experiment.power.pairs == "redundant-group":
+        return "power.pairs is 'redundant-group', and the paper's baselines are crossed with themselves"
+    # At low signal to noise the paper does not say what it averages.
+    free = (*NOT_THE_ESTIMATE, "coherent_time") if role == "low_snr" else NOT_THE_ESTIMATE
+    return _changed(experiment.power, "power", free)
 
 
 def _solver(experiment: Experiment) -> Solver | None:

@@ -20,10 +20,7 @@ QUARTER_WHY = "the exponent, to a quarter"
 HUNDREDS = 300
 """Number of antennas for the text's "hundreds"."""
 MINUTES = AtMost(600)
-MINUTES_WHY = "ten minutes are still minutes"
 THOUSANDS_OF_ANTENNAS = 3000
-HOURS = AtMost(86_400)
-HOURS_WHY = "less than a day"
 AROUND_HUNDRED = 100
 FASTER = 30
 """The paper's factor between CPU and GPU."""
@@ -36,13 +33,6 @@ def _paper_solve(run: RunTimeTable, antennas: int) -> Finding:
     """Return the seconds of the paper's solver on the GPU for so many antennas; a bound if its steps are."""
     law, steps = run.scaling("rows", "paper-step", device="gpu"), run.steps_to("0.01")
     return steps._replace(value=steps.value * float(law.at(antennas)))
-
-
-def _default_solve(run: RunTimeTable, antennas: int) -> Finding:
-    """Return the seconds of the default solver for so many antennas, with the error of the exponent."""
-    law = run.scaling("rows", "default-solve")
-    seconds = float(law.at(antennas))
-    return Finding(seconds, seconds * law.error * float(np.log(antennas / run.column("rows", "antennas").mean())))
 
 
 def _exponent(law: PowerLaw) -> Finding:
@@ -184,83 +174,37 @@ def gpu_step_constant_in_longest_baseline(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step", device="gpu"))
 
 
-MINUTES_SENTENCE = Sentence(
-    "within-minutes",
-    "solutions for arrays with hundreds of antennas within minutes on a single computer node with a GPU",
-)
-
-
 @COMPUTATION.states(
-    MINUTES_SENTENCE,
+    "solutions for arrays with hundreds of antennas within minutes on a single computer node with a GPU",
     f"paper's steps on the GPU to 1 % above the minimum, extrapolated to {HUNDREDS} antennas, s",
     MINUTES,
-    MINUTES_WHY,
+    "ten minutes are still minutes",
 )
 def paper_solve_in_minutes(run: RunTimeTable) -> Finding:
     return _paper_solve(run, HUNDREDS)
 
 
 @COMPUTATION.states(
-    MINUTES_SENTENCE,
-    f"the default solver's whole solve on one core without a GPU, extrapolated to {HUNDREDS} antennas, s",
-    MINUTES,
-    MINUTES_WHY,
-)
-def default_solve_in_minutes(run: RunTimeTable) -> Finding:
-    return _default_solve(run, HUNDREDS)
-
-
-HOURS_SENTENCE = Sentence("within-hours", "and for thousands of element arrays on timescales of hours")
-
-
-@COMPUTATION.states(
-    HOURS_SENTENCE,
+    "and for thousands of element arrays on timescales of hours",
     f"paper's steps on the GPU to 1 % above the minimum, extrapolated to {THOUSANDS_OF_ANTENNAS} antennas, s",
-    HOURS,
-    HOURS_WHY,
+    AtMost(86_400),
+    "less than a day",
 )
 def paper_solve_of_thousands_in_hours(run: RunTimeTable) -> Finding:
     return _paper_solve(run, THOUSANDS_OF_ANTENNAS)
 
 
 @COMPUTATION.states(
-    HOURS_SENTENCE,
-    f"the default solver's whole solve on one core without a GPU, extrapolated to {THOUSANDS_OF_ANTENNAS} antennas, s",
-    HOURS,
-    HOURS_WHY,
-)
-def default_solve_of_thousands_in_hours(run: RunTimeTable) -> Finding:
-    return _default_solve(run, THOUSANDS_OF_ANTENNAS)
-
-
-CRITICAL_SENTENCE = Sentence(
-    "gpu-critical",
     "GPU acceleration is critical for our technique for an interferometer with ≳ 10 antennas in a reasonable amount of "
     "time (Abstract)",
-)
-CRITICAL_WHY = "without it ten minutes at least, which would still be minutes"
-
-
-@COMPUTATION.states(
-    CRITICAL_SENTENCE,
     "paper's steps on one core to 1 % above the minimum, the array that is closest to that whose steps were counted, s",
     AtLeast(MINUTES.high),
-    CRITICAL_WHY,
+    "without it ten minutes at least, which would still be minutes",
 )
 def gpu_critical_for_paper_solver(run: RunTimeTable) -> Finding:
     closest = int(np.argmin(np.abs(run.column("rows", "antennas") - run.table["descent"]["antennas"])))
     steps = run.steps_to("0.01")
     return steps._replace(value=steps.value * float(run.medians("rows", "paper-step")[closest]))
-
-
-@COMPUTATION.states(
-    CRITICAL_SENTENCE,
-    "the default solver's whole solve on one core without a GPU, largest array, s",
-    AtLeast(MINUTES.high),
-    CRITICAL_WHY,
-)
-def gpu_critical_for_default_solver(run: RunTimeTable) -> Finding:
-    return Finding(float(run.medians("rows", "default-solve")[-1]), 0.0)
 
 
 CAVEATS = Source("Caveats and Limitations", ("minimally_redundant",))

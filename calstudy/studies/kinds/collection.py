@@ -38,7 +38,10 @@ class Member(Section):
 
     file: Path = Field(strict=False, description="The experiment file; a relative path starts at the collection file.")
     name: StudyName | None = Field(None, description="Replaces the experiment's own name.")
-    overrides: dict[str, Any] = Field(default_factory=dict, description="Fields to change (dotted path: value).")
+    overrides: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Fields to change (dotted path: value); relative paths start at the folder of `file`.",
+    )
 
 
 def _block(member: Any) -> Any:

@@ -198,7 +198,10 @@ class Family(Study):
     def content(self) -> Any:
         """The file without scales and outputs, and the names of the run folders of the members."""
         names = [name for name in type(self.file).model_fields if name not in ("scales", "outputs")]
+        reference = KINDS.reference_of(type(self))
+        own = {} if reference in KINDS.built_in() else {KINDS.tag: KINDS.identity(reference)}
         return {
+            **own,
             "file": {name: identity(getattr(self.file, name)) for name in names},
             "members": {name: study.folder.name for name, study in self.studies.items()},
         }

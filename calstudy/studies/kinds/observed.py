@@ -10,11 +10,12 @@ from pydantic import Field
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.plugins import guarded
+from calstudy.base.visibilities import require_earth_orientation
 from calstudy.experiment.files import StudyFile
 from calstudy.experiment.model import FIGURES, Scales
 from calstudy.figures import figure_task, figures_for
 from calstudy.instrument.interface import model_of
-from calstudy.power.interface import require_antennas
+from calstudy.power.interface import require_antennas, require_modes
 from calstudy.power.settings import PowerSettings
 from calstudy.products.table import tables_of
 from calstudy.realdata.halves import PARITIES, Parts, require_same_samples, require_same_sky
@@ -132,8 +133,10 @@ def _halves(file: ObservedFile) -> Parts:
     odd = read_selected(file, section.odd) if section.odd else even
     for facts in (even, odd):
         require_antennas(file.power, facts.frame.numbers, "leave them out by observed.select.antennas")
+        require_modes(file.power, facts.frame.lengths, facts.frame.frequencies)
         if file.injection is not None:
             require_fine_maps(file.injection.eor, facts.frame.lengths, facts.channels.band, "injection.eor")
+            require_earth_orientation(facts.times, "observed.data")
     if section.odd:
         require_same_sky(even, odd, section.sky_model)
     elif section.difference:

@@ -58,13 +58,15 @@ class Basin:
     """Results of the fits, by start and true gains.
 
     `gain_errors` are standard deviations per channel (Ne,), and `delays` are the largest cable delays in s (Nd,), both
-    ascending. `misfit`, (Ns, Ne, Nd), is the rms of V - g_a g_b* F over that of a fit that starts at the true gains,
+    ascending. `floor`, (Ne, Nd), is the rms of V - g_a g_b* F of a fit that starts at the true gains over that of the
+    noise. `misfit`, (Ns, Ne, Nd), is the rms of V - g_a g_b* F over that of a fit that starts at the true gains,
     and `converged`, (Ns, Ne, Nd), is the status. A fit with a misfit below `arrived` has found the minimum.
     """
 
     starts: tuple[str, ...]
     gain_errors: np.ndarray
     delays: np.ndarray
+    floor: np.ndarray
     misfit: np.ndarray
     converged: np.ndarray
     arrived: float
@@ -77,7 +79,7 @@ def _unity() -> dict[str, Start]:
 class BasinOfConvergence(SingleIntegrationStep):
     """The distance from the true gains at which a fit may start, and the number of false statuses."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     number = "2.2"
     proves = "the range of starting errors from which the fit converges, and that its status is correct everywhere"
     parameters: ClassVar = {
@@ -102,6 +104,11 @@ class BasinOfConvergence(SingleIntegrationStep):
             "number of fits with status 'converged' whose misfit is more than 10 % above that of a fit from the truth",
             AtMost(0),
             "a status must never be wrong",
+        ),
+        "floor": Limit(
+            "misfit of fits from the truth over the rms of the noise, largest value",
+            AtMost(1.1),
+            "what fits are compared with must be at the noise; to 10 %, as above",
         ),
         "paper_case": Limit(
             "misfit over that of a fit from the truth, at the paper's gain errors of 0.1, from unity",
@@ -130,10 +137,11 @@ class BasinOfConvergence(SingleIntegrationStep):
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Fit data with all these gain errors; write the table basin.csv and the figure."""
         integration = self.integration(runs)
-        fits = {}
+        fits, floors = {}, []
         for error, delay in itertools.product(self.gain_errors, self.delays):
             visibilities, gains = _data(integration, error, delay)
             floor = _misfit(integration, integration.calibrate(visibilities, start=gains), visibilities)
+            floors.append(floor / rms(visibilities - integration.products(gains) * integration.modelled))
             for name, start in self.starts.items():
                 settings = integration.settings.model_copy(update={"initial_gains": start.initial_gains})
                 result = integration.calibrate(visibilities, settings, sky_model=start.sky_model)
@@ -144,6 +152,7 @@ class BasinOfConvergence(SingleIntegrationStep):
             starts=tuple(self.starts),
             gain_errors=np.array(self.gain_errors),
             delays=np.array(self.delays),
+            floor=np.reshape(floors, shape[1:]),
             misfit=np.reshape([fits[cell][1] for cell in cells], shape),
             converged=np.reshape([fits[cell][0].status == "converged" for cell in cells], shape),
             arrived=ARRIVED,
@@ -178,6 +187,7 @@ def _findings(basin: Basin) -> dict[str, Finding]:
     found = {
         "false_convergence": Finding(float(np.sum(basin.converged & ~arrived)), 0.0),
         "missed_convergence": Finding(float(np.sum(~basin.converged & arrived)), 0.0),
+        "floor": Finding(float(basin.floor.max()), 0.0),
         "paper_case": Finding(float(basin.misfit[0, paper, np.argmin(basin.delays)]), 0.0),
         "largest_gain_error": Finding(float(basin.gain_errors[without_delay].max(initial=0.0)), 0.0),
         "arrived": Finding(float(arrived[0].mean()), 0.0),

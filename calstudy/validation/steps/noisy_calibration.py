@@ -53,7 +53,7 @@ from calstudy.validation.step import (
     required,
 )
 from calstudy.validation.steps.single_fit import first_integrations
-from calstudy.verdicts.criterion import AtMost, Finding, Within
+from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
 
 HUGE = 1e6
 VARIANT = Variant(components=("foregrounds", "noise"), effects=True, calibrate=True)
@@ -224,7 +224,7 @@ class LowSnr(Step):
     """
 
     kind: str = "low-snr"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     number = "3.0"
     proves = "cable reflections below the noise of a baseline are removed"
     experiments: ClassVar = {"lowsnr": Case("lowsnr.yaml", small=SMALL)}
@@ -234,6 +234,11 @@ class LowSnr(Step):
             "|P^R| at the reflections over 2 sigma of the noise",
             AtMost(1),
             "consistent with the noise",
+        ),
+        "artefact_sigmas": Limit(
+            "P^V at the reflections over sigma of the noise, before calibration",
+            AtLeast(10),
+            "there must be something to remove: ten times what may be left, 1 sigma",
         ),
     }
 
