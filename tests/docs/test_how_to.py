@@ -11,6 +11,7 @@ import pytest
 from how_to_pages import DOCS, PAGES, HowTo, follow, read_page
 
 from calstudy.base.package_files import published
+from calstudy.run.execution import Budget
 from calstudy.studies.load import load_study
 
 LARGEST = 150_000
@@ -63,7 +64,9 @@ def test_the_experiments_and_programs_of_a_page_are_valid(page, tmp_path, monkey
         words = shlex.split(line, comments=True)
         if words[:2] == ["calstudy", "run"]:
             changes = [words[place + 1] for place, word in enumerate(words) if word == "--set"]
-            assert load_study(Path(words[2]), overrides=changes).name
+            study = load_study(Path(words[2]), overrides=changes)
+            # Which also reads beams and catalogues.
+            assert study.sized_to(Budget(workers=1))[0].name
 
 
 @pytest.fixture(scope="module")
