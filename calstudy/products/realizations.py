@@ -13,7 +13,7 @@ from calstudy.base.resources import Cost
 from calstudy.base.table import Table, number
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.experiment.realizations import described, expand_realizations, members
-from calstudy.power.binned import make_bin_edges, noise_level, spherical_average, with_errors
+from calstudy.power.binned import make_bin_edges, spherical_average, with_errors
 from calstudy.power.cosmology import input_power
 from calstudy.power.realizations import (
     QUANTITIES,
@@ -159,7 +159,7 @@ def _reduced(graph: Graph) -> Task:
     )
 
 
-class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
+class Reduced(Task, stage="realization", version=2, cost=Cost(10, disk=1e6)):
     """P^R with and without the EoR and P^S in all regions, with errors as in `calstudy.products.spectra`."""
 
     power: PowerSettings
@@ -175,16 +175,18 @@ class Reduced(Task, stage="realization", version=1, cost=Cost(10, disk=1e6)):
         """Write the spectra, and the input power at the same k."""
         power = self.power
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}
-        sigma_noise = 0.0 if self.noise is None else noise_level(spectra.read_delay_spectra(self.noise))
         residual, without, eor = SIGNAL_LOSS_VARIANTS
+        noise = dict.fromkeys((residual, without), 0.0)
+        if self.noise is not None:
+            noise = {name: spectra.noise_of_spectra(getattr(self, name), self.noise) for name in noise}
         for region in REGIONS:
             means = {
                 name: spherical_average(found, power, region == "outside-wedge", region == "inside-wedge")
                 for name, found in delays.items()
             }
             errors: dict[str, dict[str, Any]] = {
-                residual: {"noise": sigma_noise, "signal": means[eor]},
-                without: {"noise": sigma_noise},
+                residual: {"noise": noise[residual], "signal": means[eor]},
+                without: {"noise": noise[without]},
                 eor: {"signal": means[eor]},
             }
             for name, mean in means.items():

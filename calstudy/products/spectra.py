@@ -18,7 +18,16 @@ from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
-from calstudy.products.files import AVERAGE, DATA, RESIDUAL, read_visibilities, spectrum_file, write_visibilities
+from calstudy.products.files import (
+    AVERAGE,
+    DATA,
+    RESIDUAL,
+    read_json,
+    read_visibilities,
+    spectrum_file,
+    write_json,
+    write_visibilities,
+)
 from calstudy.products.graph import Graph, memoize, size_of
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
@@ -34,7 +43,7 @@ EXCISION = {"all-modes": False, "outside-wedge": True}
 """Spherical averages; true for the one without the wedge."""
 NOT_OF_DELAY_SPECTRA = ("coherent_time", "bins", "wedge_buffer", "length_bin")
 """Fields of the power section that act before or after the estimate of delay spectra."""
-DELAY_SPECTRA = "delay-spectra.h5"
+DELAY_SPECTRA, SAMPLES = "delay-spectra.h5", "samples.json"
 
 
 @memoize
@@ -138,8 +147,8 @@ class Average(InBlocks, stage="average", version=2):
         return Cost(seconds, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
 
 
-class Power(Task, stage="power", version=4):
-    """The delay power spectra of two averages."""
+class Power(Task, stage="power", version=5):
+    """The delay power spectra of two averages, and since version 5 how much noise missing samples add."""
 
     beam: Beam
     channels: Channels
@@ -156,6 +165,7 @@ class Power(Task, stage="power", version=4):
 
         even, odd = averages = [read_visibilities(folder / AVERAGE) for folder in (self.even, self.odd)]
         empty = any(uvd.flag_array.all() for uvd in averages)
+        write_json(output / SAMPLES, {"noise": _noise_of_missing_samples(averages)})
         if empty:
             for uvd in averages:
                 uvd.flag_array[:] = False
@@ -178,6 +188,24 @@ class Power(Task, stage="power", version=4):
         return Cost(seconds, 1.6e9, (3 + blocks) * spectra * COMPLEX128)
 
 
+def _noise_of_missing_samples(averages: Sequence[UVData]) -> float | None:
+    """Return the rms noise of even times odd over that of averages of all samples, None if all are flagged."""
+    used = ~np.logical_or.reduce([uvd.flag_array for uvd in averages])
+    if not used.any():
+        return None
+    return float(np.sqrt(np.prod([np.mean(1 / uvd.nsample_array[used].astype(float)) for uvd in averages])))
+
+
+def noise_of_spectra(folder: Path, noise: Path) -> float:
+    """Return sigma_N of a single product for spectra of data that lack samples which the spectra of `noise` have.
+
+    Integrations without a solution are flagged in calibrated data, and not in the noise. Both are products of the stage
+    `power`.
+    """
+    more, of_noise = (read_json(found / SAMPLES)["noise"] for found in (folder, noise))
+    return noise_level(read_delay_spectra(noise)) * ((more or of_noise) / of_noise)
+
+
 def read_delay_spectra(folder: Path) -> DelaySpectra:
     """Read a product of the stage `power`."""
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
@@ -189,12 +217,12 @@ def read_recovered(folder: Path) -> list[SphericalSpectrum]:
     return [load_spectrum(file, SphericalSpectrum) for file in files]
 
 
-class Spectra(Task, stage="spectra", version=4):
+class Spectra(Task, stage="spectra", version=5):
     """Wedge and spherical spectra of all variants, with errors.
 
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
     (paper section Reduction of Simulation Products); each enters the variants that contain its component. Equal lengths
-    share a bin of the wedge since version 4.
+    share a bin of the wedge since version 4; integrations that were not solved are not averaged noise since 5.
     """
 
     power: PowerSettings
@@ -204,23 +232,25 @@ class Spectra(Task, stage="spectra", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write, for every variant, wedge.h5 and the two spherical spectra, as HDF5 and CSV."""
-        reference = {name: read_delay_spectra(folder) for name, folder in self.reference.items()}
-        sigma_noise = noise_level(reference["noise"]) if "noise" in reference else 0.0
-        signals = {name: spherical_average(reference["eor"], self.power, excise) for name, excise in EXCISION.items()}
+        noise, eor = self.reference.get("noise"), read_delay_spectra(self.reference["eor"])
+        signals = {name: spherical_average(eor, self.power, excise) for name, excise in EXCISION.items()}
         for name, variant in self.variants.items():
             found = read_delay_spectra(self.spectra[name])
             if not np.isfinite(found.power).any():
                 raise InputError(f"variants.{name}: all data are flagged, because no solve gave gains")
             save_spectrum(output / spectrum_file(name, "wedge"), cylindrical_average(found, self.power))
+            sigma_noise = 0.0
+            if noise is not None and "noise" in variant.components:
+                sigma_noise = noise_of_spectra(self.spectra[name], noise)
             for modes, excise in EXCISION.items():
                 spectrum = with_errors(
                     spherical_average(found, self.power, excise),
-                    noise=sigma_noise if "noise" in variant.components else 0.0,
+                    noise=sigma_noise,
                     signal=signals[modes] if "eor" in variant.components else None,
                 )
                 save_spectrum(output / spectrum_file(name, modes), spectrum)
                 write_csv(output / f"{name}.{modes}.csv", spectrum)
-        return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
+        return {"sigma_noise_mk2_h3_mpc3": 0.0 if noise is None else noise_level(read_delay_spectra(noise))}
 
     def _cost(self) -> Cost:
         baselines = size_of(self).baselines
