@@ -92,7 +92,10 @@ def test_a_run_folder_is_that_of_the_content_of_files_that_are_named_by_their_pa
     def folder():
         return calstudy.load("quickstart", **changes).folder
 
+    # A text that is no field of files may name one.
+    changes["description"] = str(tmp_path)
     before = folder()
+    (tmp_path / "notes").write_text("of no study")
     assert folder() == before
     positions(tmp_path / "other.csv", 3)
     assert folder() != before

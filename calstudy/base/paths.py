@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -100,6 +100,19 @@ def texts(value: Any) -> Iterator[str]:
     """Yield all texts in nested blocks and lists."""
     if isinstance(value, str):
         yield value
-    elif isinstance(value, Mapping | list):
+    elif isinstance(value, Mapping | list | tuple):
         for item in value.values() if isinstance(value, Mapping) else value:
             yield from texts(item)
+
+
+def blocks(value: Any, keys: Collection[str]) -> Iterator[Any]:
+    """Yield what has any of these keys in nested blocks and lists."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if key in keys:
+                yield item
+            else:
+                yield from blocks(item, keys)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from blocks(item, keys)

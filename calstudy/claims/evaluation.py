@@ -180,7 +180,7 @@ def _measured_on(statement: Statement, runs: Mapping[str, Any]) -> tuple[Stateme
     """Return a statement, with its measure on realizations if these play its roles, and the runs for its measure."""
     played = [runs[role] for role in statement.roles if role in runs]
     if statement.pooled and played and all(isinstance(run, PooledResults) for run in played):
-        quantity = f"{statement.quantity}; mean over realizations, error by their scatter"
+        quantity = f"{statement.quantity}; mean over realizations"
         return replace(statement, measure=statement.pooled, quantity=quantity), dict(runs)
     return statement, {role: run for role, run in runs.items() if not isinstance(run, PooledResults)}
 

@@ -90,15 +90,11 @@ class PooledResults:
             raise Unevaluated(f"no modes between k = {k_min:g} and {k_max:g} h/Mpc in all realizations")
         return found
 
-    def bias_extent(self, modes: str) -> Finding:
-        """Return the k up to which P^R is biased (`bias_extent`), h/Mpc, of one realization.
-
-        It is their mean, with the scatter of single ones, as is that of a paper. `modes` are those of `mean`.
-        """
+    def bias_extents(self, modes: str) -> np.ndarray:
+        """Return the k up to which P^R of each realization is biased (`bias_extent`), h/Mpc, (K,)."""
         values, errors = (self.arrays[f"{modes}.{kind}.ratio"] for kind in ("values", "quoted"))
         edges = self.arrays[f"{modes}.bin_edges"]
-        found = [bias_extent(*one, edges) for one in zip(values, errors, strict=True)]
-        return Finding(float(np.mean(found)), float(np.std(found, ddof=1)))
+        return np.array([bias_extent(*one, edges) for one in zip(values, errors, strict=True)])
 
     @property
     def _design(self) -> Design:
@@ -106,6 +102,11 @@ class PooledResults:
         blocks = zip(experiment.realizations, members(experiment), strict=True)
         draws = [item.draws for item in expand_realizations(experiment)]
         return Design(draws, [(block.draw, places) for block, places in blocks])
+
+
+def of_one_draw(values: np.ndarray) -> Finding:
+    """Return the mean of realizations with the scatter of single ones: a paper's number is of one."""
+    return Finding(float(np.mean(values)), float(np.std(values, ddof=1)))
 
 
 def over_realizations(

@@ -125,7 +125,7 @@ def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
 
 @style.journal_style()
 def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> Figure:
-    """Draw the means over realizations, over the power of the signals, with 95 % bars.
+    """Draw the means over realizations, over the power of the signals, with bars of 1.96 standard errors.
 
     A row for each kind of signal, and a column for each calibrator, by their names.
     """

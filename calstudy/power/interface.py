@@ -76,6 +76,8 @@ def require_antennas(settings: PowerSettings, numbers: np.ndarray, remedy: str) 
 def require_modes(settings: PowerSettings, lengths: np.ndarray, frequencies: np.ndarray) -> None:
     """Raise InputError if spherical spectra have no mode; baseline `lengths` are in m, channels in Hz."""
     lengths = np.unique(lengths[lengths > 0])
+    if not lengths.size:
+        raise InputError("power: all baselines have a length of zero, and none has a mode outside the wedge")
     found = delays(frequencies.size, channel_width(frequencies))
     modes = modes_of(found, lengths, float(frequencies.mean()), settings)
     outside = outside_wedge(modes, settings.wedge_buffer)

@@ -23,8 +23,8 @@ OUTCOMES = ("supported", "contradicted", "mixed", "undecided", "not evaluated")
 def outcomes_of_sentences(verdicts: Iterable[Verdict]) -> dict[str, str]:
     """Return the outcome of each sentence by its id, without statements on the simulation alone.
 
-    It is that of its evaluated statements. Supported statements beside undecided ones leave it undecided; it is "mixed"
-    if some are contradicted and others are not.
+    It is that of its evaluated statements. Supported statements beside others that are undecided or not evaluated leave
+    it undecided; it is "mixed" if some are contradicted and others are not.
     """
     found: dict[str, set[str]] = {}
     for verdict in verdicts:
@@ -34,9 +34,9 @@ def outcomes_of_sentences(verdicts: Iterable[Verdict]) -> dict[str, str]:
 
 
 def _together(outcomes: set[str]) -> str:
-    evaluated = outcomes - {"not evaluated"}
-    if evaluated == {"supported", "undecided"}:
+    if "supported" in outcomes and "contradicted" not in outcomes and len(outcomes) > 1:
         return "undecided"
+    evaluated = outcomes - {"not evaluated"}
     return "mixed" if len(evaluated) > 1 else next(iter(evaluated or outcomes))
 
 

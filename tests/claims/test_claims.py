@@ -23,8 +23,6 @@ GROUPS = {"calibration": {"calibrator": "calamity-redundant"}}
 
 
 NEVER_SUPPORTED = {
-    # One draw of noise is within one sigma in two of three cases; these worlds have the third.
-    "artefact-removed",
     # Means of three and seven bins have errors of 0.6 and 0.4 of the noise: too much for a factor of two.
     "bias-at-level-of-noise-below-0p2",
     "bias-at-level-of-noise-from-0p2-to-0p5",

@@ -157,9 +157,9 @@ def test_sentences_are_counted_and_statements_on_the_simulation_apart(tmp_path):
         stated(AtLeast(0), both, simulated, "fifth").judge(open_),
         stated(AtLeast(0), "data", simulated, "sixth").judge(yes),
     ]
-    assert outcomes_of_sentences(verdicts) == {"both": "mixed", "third": "undecided", "fourth": "supported"}
+    assert outcomes_of_sentences(verdicts) == {"both": "mixed", "third": "undecided", "fourth": "undecided"}
     assert tally_of_sentences(verdicts) == (
-        "3 sentences: 1 supported, 1 mixed, 1 undecided; "
+        "3 sentences: 1 mixed, 2 undecided; "
         "5 statements: 2 supported, 1 contradicted, 1 undecided, 1 not evaluated; "
         "2 statements on the simulation alone: 1 supported, 1 undecided"
     )
@@ -167,7 +167,7 @@ def test_sentences_are_counted_and_statements_on_the_simulation_apart(tmp_path):
     later = [stated(AtLeast(0), name="third").judge(no), stated(AtLeast(0), both, name="first").unevaluated("no run")]
     together = combined([verdicts, later])
     assert [verdict.name for verdict in together] == [verdict.name for verdict in verdicts]
-    assert outcomes_of_sentences(together) == {"both": "mixed", "third": "contradicted", "fourth": "supported"}
+    assert outcomes_of_sentences(together) == {"both": "mixed", "third": "contradicted", "fourth": "undecided"}
     write_claims(verdicts, tmp_path, "run")
     text = (tmp_path / CLAIMS_MARKDOWN).read_text()
     assert tally_of_sentences(verdicts) in text.splitlines()

@@ -194,7 +194,7 @@ def _other_channels(role: str, experiment: Experiment) -> str | None:
 
 
 def _other_power(role: str, experiment: Experiment) -> str | None:
-    if role == "minimally_redundant" and experiment.power.pairs == "redundant-group":
+    if role in ("minimally_redundant", "other_channels") and experiment.power.pairs == "redundant-group":
         return "power.pairs is 'redundant-group', and the paper's baselines are crossed with themselves"
     # At low signal to noise the paper does not say what it averages.
     free = (*NOT_THE_ESTIMATE, "coherent_time") if role == "low_snr" else NOT_THE_ESTIMATE

@@ -20,11 +20,11 @@ from calstudy.claims.bins import (
     rms_without_eor,
     used_bins,
 )
-from calstudy.claims.realizations import PooledResults, over_realizations
+from calstudy.claims.realizations import PooledResults, of_one_draw, over_realizations
 from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, median
 from calstudy.papers.calamity2022.window import ONE_DRAW, TENTH, TENTH_WHY, UNBIASED, agreement
 from calstudy.results.reader import Results
-from calstudy.verdicts.criterion import AtLeast, Finding, Within
+from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 
 REDUNDANT = Source("Performance on a Redundant Array", ("minimally_redundant", "redundant"))
@@ -132,6 +132,17 @@ def less_of_the_eor_below_0p3(minimal: Results, redundant: Results) -> Finding:
 
 
 @REDUNDANT.states(
+    HIGHER_LOSS,
+    "T free of the flux scale of the minimally redundant array minus that of the redundant one, bin by bin, outside "
+    "the wedge, k < 0.3",
+    AtLeast(0, 2),
+    "higher beyond the errors",
+)
+def more_loss_of_power_below_0p3(minimal: Results, redundant: Results) -> Finding:
+    return difference_of_losses(minimal, redundant, 0.0, K_LOSS - TINY)
+
+
+@REDUNDANT.states(
     "fewer independent realizations are averaged down in each gain solution, which increases signal loss on all scales",
     "T free of the flux scale of the minimally redundant array minus that of the redundant one, bin by bin, outside "
     "the wedge, k >= 0.3",
@@ -143,15 +154,18 @@ def more_loss_on_all_scales_without_flux_scale(minimal: Results, redundant: Resu
 
 
 def _longer_extent(minimal: PooledResults, redundant: PooledResults) -> Finding:
-    first, second = (run.bias_extent("outside-wedge") for run in (minimal, redundant))
-    return Finding(second.value - first.value, float(np.hypot(first.uncertainty, second.uncertainty)))
+    first, second = (run.bias_extents("outside-wedge") for run in (minimal, redundant))
+    if first.shape != second.shape:
+        raise Unevaluated("the arrays have different realizations")
+    return of_one_draw(second - first)
 
 
 @REDUNDANT.states(
     "the residual in our redundant array has a negative bias at larger k than the minimally redundant array",
-    "difference in h/Mpc of the k up to which P^R < P^S beyond 95 % errors, outside the wedge",
+    "difference in h/Mpc of the k up to which P^R < P^S beyond 95 % errors, outside the wedge; ± is the scatter of "
+    "draws",
     AtLeast(0, 2),
-    "larger beyond the scatter of realizations",
+    "larger beyond that scatter",
     pooled=_longer_extent,
 )
 def bias_reaches_larger_k(minimal: Results, redundant: Results) -> Finding:
@@ -276,15 +290,19 @@ REMOVED = Sentence(
 
 @LOW_SNR.states(
     REMOVED,
-    "mean P^R near 1200 ns, in standard deviations of the noise",
-    Within(-SEEN, SEEN),
-    "what is beyond the noise by 3 sigma is seen",
+    "mean P^R near 1200 ns over mean P^V there",
+    AtMost(10**-0.5),
+    "removed is an order of magnitude at least, to half an order",
 )
 def artefact_removed(run: Results) -> Finding:
-    spectrum = run.spherical("residual", "outside-wedge")
-    chosen = reflection_bins(run, run.experiment, spectrum)
-    error = spectrum.noise_error[chosen]
-    return Finding(float(np.sum(spectrum.power.real[chosen] / error**2) / np.sqrt(np.sum(error**-2.0))), 1.0)
+    before, after = (run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual"))
+    chosen = reflection_bins(run, run.experiment, after)
+    weights = after.noise_error[chosen] ** -2.0
+    artefact, left = (float(np.sum(weights * item.power.real[chosen]) / weights.sum()) for item in (before, after))
+    sigma = float(weights.sum() ** -0.5)
+    if artefact < SEEN * sigma:
+        raise Unevaluated("there is no artefact before the calibration that could be removed")
+    return Finding(left / artefact, sigma / artefact)
 
 
 @LOW_SNR.states(

@@ -534,12 +534,13 @@ def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> dict[str,
         base, folder = read_mapping(content.experiment), content.experiment.parent
     if (kind := kind_of(base, folder)).model is not Experiment:
         raise ExperimentError([f"experiment: has the key {kind.key or KINDS.tag!r}, and is no single experiment"])
+    has_it = scale in (base.get("scales") or {})
+    base = apply_scale(base, scale if has_it or not optional else None)
     if many := [key for key in ("sweep", "realizations") if base.get(key)]:
         raise ExperimentError(
             [f"experiment: has {many[0]}, which a comparison does not make: name a file without, or leave it out"]
         )
-    has_it = scale in (base.get("scales") or {})
-    base = _shared(apply_scale(base, scale if has_it or not optional else None))
+    base = _shared(base)
     if folder == file.folder:
         return base
     try:
