@@ -14,8 +14,8 @@ from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.visibilities import polarization_names
 from calstudy.power.binned import independent_times, make_bin_edges
-from calstudy.power.delay import TAPERS, channel_width, delays
-from calstudy.power.settings import ESTIMATORS, PowerSettings
+from calstudy.power.delay import TAPERS, channel_width, delays, horizon_delay
+from calstudy.power.settings import ESTIMATORS, KBins, PowerSettings
 from calstudy.power.spectra import DelaySpectra, average_times, bins_of_k, modes_of, outside_wedge
 
 if TYPE_CHECKING:
@@ -79,17 +79,19 @@ def require_modes(settings: PowerSettings, lengths: np.ndarray, frequencies: np.
     if not lengths.size:
         raise InputError("power: all baselines have a length of zero, and none has a mode outside the wedge")
     found = delays(frequencies.size, channel_width(frequencies))
-    modes = modes_of(found, lengths, float(frequencies.mean()), settings)
-    outside = outside_wedge(modes, settings.wedge_buffer)
-    if not outside.any():
+    farthest = float(np.abs(found).max())
+    if farthest <= horizon_delay(float(lengths[0])) + settings.wedge_buffer:
         raise InputError(
             f"power.wedge_buffer = {1e6 * settings.wedge_buffer:g} us: no mode is outside the wedge: the shortest "
-            f"baseline has {lengths[0]:.3g} m, and delays reach {1e6 * np.abs(found).max():.4g} us; give a smaller "
-            "one, or narrower channels"
+            f"baseline has {lengths[0]:.3g} m, and delays reach {1e6 * farthest:.4g} us; give a smaller one, or "
+            "narrower channels"
         )
-    edges = make_bin_edges(settings.bins)
+    if settings.bins == KBins():
+        # They have modes of any band; a plan is faster without cosmology.
+        return
+    modes, edges = modes_of(found, lengths, float(frequencies.mean()), settings), make_bin_edges(settings.bins)
     if (bins_of_k(modes, edges, settings.wedge_buffer) < 0).all():
-        k = np.hypot(modes.k_perp[:, None], modes.k_parallel)[outside]
+        k = np.hypot(modes.k_perp[:, None], modes.k_parallel)[outside_wedge(modes, settings.wedge_buffer)]
         raise InputError(
             f"power.bins: no mode outside the wedge is between {edges[0]:g} and {edges[-1]:g} h/Mpc; they are between "
             f"{k.min():.3g} and {k.max():.3g} h/Mpc"

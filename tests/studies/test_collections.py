@@ -145,8 +145,8 @@ def test_a_second_run_makes_nothing_and_a_member_alone_has_everything(finished, 
 
 
 def test_scale_and_overrides_reach_every_member(folder):
-    changed = load_study(write(folder), overrides=["power.taper=hann"])
-    assert {experiment.power.taper for experiment in changed.members.values()} == {"hann"}
+    changed = load_study(write(folder), overrides=["power.length_bin=5 m"])
+    assert {experiment.power.length_bin for experiment in changed.members.values()} == {5.0}
     with pytest.raises(InputError, match=r"experiments\.0 \(hex\.yaml\): --scale small"):
         load_study(write(folder), scale="small")
 
@@ -281,7 +281,7 @@ def test_the_plan_in_json_is_alone_on_standard_output(finished, folder, tmp_path
 
 
 def test_a_finished_run_of_something_else_is_not_taken(finished, folder, tmp_path):
-    text, other = io.StringIO(), elsewhere(folder, tmp_path, "power.taper=hann")
+    text, other = io.StringIO(), elsewhere(folder, tmp_path, "power.length_bin=5 m")
     with pytest.raises(InputError, match=r"no finished run of a member is there \(members: hexagon, redundant\)"):
         other.with_finished([finished.folder.parent], Console(file=text, width=300))
     assert "is left out; its tables are of other settings, or another version of a stage" in text.getvalue()

@@ -150,7 +150,7 @@ def test_an_artefact_without_a_number_is_not_removed(monkeypatch):
     run = SimpleNamespace(spherical=lambda variant, _modes: spectra[variant], experiment=None)
     monkeypatch.setattr(noisy_calibration, "reflection_bins", lambda *items: np.isfinite(items[-1].power.real))
     step = STEPS.make({"kind": "low-snr"})
-    assert verdicts(step, step.measure({"lowsnr": run}, Path())) == {"left": "not evaluated"}
+    assert verdicts(step, step.measure({"lowsnr": run}, Path())) == {"left": "not evaluated", "artefact_sigmas": "PASS"}
 
 
 def test_powers_without_a_number_have_no_distribution():
