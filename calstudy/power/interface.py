@@ -15,13 +15,16 @@ from calstudy.base.plugins import Plugin, guarded
 from calstudy.base.visibilities import polarization_names
 from calstudy.power.binned import independent_times, make_bin_edges
 from calstudy.power.delay import TAPERS, channel_width, delays, horizon_delay
-from calstudy.power.settings import ESTIMATORS, KBins, PowerSettings
+from calstudy.power.settings import ESTIMATORS, PowerSettings
 from calstudy.power.spectra import DelaySpectra, average_times, bins_of_k, modes_of, outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
 
 logger = logging.getLogger(__name__)
+
+USUAL_K = 0.5
+"""Bins from zero to this, h/Mpc, or more, have modes of arrays with baselines of some 200 m or less."""
 
 
 class PowerBeam(Protocol):
@@ -86,8 +89,8 @@ def require_modes(settings: PowerSettings, lengths: np.ndarray, frequencies: np.
             f"baseline has {lengths[0]:.3g} m, and delays reach {1e6 * farthest:.4g} us; give a smaller one, or "
             "narrower channels"
         )
-    if settings.bins == KBins():
-        # They have modes of any band; a plan is faster without cosmology.
+    if settings.bins.min == 0 and settings.bins.max >= USUAL_K:
+        # A plan is faster without cosmology.
         return
     modes, edges = modes_of(found, lengths, float(frequencies.mean()), settings), make_bin_edges(settings.bins)
     if (bins_of_k(modes, edges, settings.wedge_buffer) < 0).all():
