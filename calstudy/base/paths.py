@@ -96,23 +96,14 @@ def differences(first: Any, second: Any, path: str = "") -> Iterator[tuple[str, 
         yield path, first, second
 
 
-def texts(value: Any) -> Iterator[str]:
-    """Yield all texts in nested blocks and lists."""
+def texts(value: Any, below: Collection[str] = ()) -> Iterator[str]:
+    """Yield all texts in nested blocks and lists, or only those below one of some keys."""
     if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping | list | tuple):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            yield from texts(item)
-
-
-def blocks(value: Any, keys: Collection[str]) -> Iterator[Any]:
-    """Yield what has any of these keys in nested blocks and lists."""
-    if isinstance(value, Mapping):
+        if not below:
+            yield value
+    elif isinstance(value, Mapping):
         for key, item in value.items():
-            if key in keys:
-                yield item
-            else:
-                yield from blocks(item, keys)
+            yield from texts(item, () if key in below else below)
     elif isinstance(value, list | tuple):
         for item in value:
-            yield from blocks(item, keys)
+            yield from texts(item, below)

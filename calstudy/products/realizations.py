@@ -13,7 +13,7 @@ from calstudy.base.resources import Cost
 from calstudy.base.table import Table, number
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Variant
 from calstudy.experiment.realizations import described, expand_realizations, members
-from calstudy.power.binned import make_bin_edges, spherical_average, with_errors
+from calstudy.power.binned import make_bin_edges, noise_level, spherical_average, with_errors
 from calstudy.power.cosmology import input_power
 from calstudy.power.realizations import (
     QUANTITIES,
@@ -178,7 +178,8 @@ class Reduced(Task, stage="realization", version=2, cost=Cost(10, disk=1e6)):
         residual, without, eor = SIGNAL_LOSS_VARIANTS
         noise = dict.fromkeys((residual, without), 0.0)
         if self.noise is not None:
-            noise = {name: spectra.noise_of_spectra(getattr(self, name), self.noise) for name in noise}
+            level = noise_level(spectra.read_delay_spectra(self.noise))
+            noise = {name: level * spectra.excess_noise(getattr(self, name), self.noise) for name in noise}
         for region in REGIONS:
             means = {
                 name: spherical_average(found, power, region == "outside-wedge", region == "inside-wedge")

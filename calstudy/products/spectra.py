@@ -196,14 +196,13 @@ def _noise_of_missing_samples(averages: Sequence[UVData]) -> float | None:
     return float(np.sqrt(np.prod([np.mean(1 / uvd.nsample_array[used].astype(float)) for uvd in averages])))
 
 
-def noise_of_spectra(folder: Path, noise: Path) -> float:
-    """Return sigma_N of a single product for spectra of data that lack samples which the spectra of `noise` have.
+def excess_noise(folder: Path, noise: Path) -> float:
+    """Return sigma_N of spectra over that of the spectra of `noise` alone, two products of the stage `power`.
 
-    Integrations without a solution are flagged in calibrated data, and not in the noise. Both are products of the stage
-    `power`.
+    Integrations without a solution are flagged in calibrated data, and not in the noise.
     """
-    more, of_noise = (read_json(found / SAMPLES)["noise"] for found in (folder, noise))
-    return noise_level(read_delay_spectra(noise)) * ((more or of_noise) / of_noise)
+    found, of_noise = (read_json(product / SAMPLES)["noise"] for product in (folder, noise))
+    return (found or of_noise) / of_noise
 
 
 def read_delay_spectra(folder: Path) -> DelaySpectra:
@@ -233,24 +232,25 @@ class Spectra(Task, stage="spectra", version=5):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write, for every variant, wedge.h5 and the two spherical spectra, as HDF5 and CSV."""
         noise, eor = self.reference.get("noise"), read_delay_spectra(self.reference["eor"])
+        sigma_noise = 0.0 if noise is None else noise_level(read_delay_spectra(noise))
         signals = {name: spherical_average(eor, self.power, excise) for name, excise in EXCISION.items()}
         for name, variant in self.variants.items():
             found = read_delay_spectra(self.spectra[name])
             if not np.isfinite(found.power).any():
                 raise InputError(f"variants.{name}: all data are flagged, because no solve gave gains")
             save_spectrum(output / spectrum_file(name, "wedge"), cylindrical_average(found, self.power))
-            sigma_noise = 0.0
+            own_noise = 0.0
             if noise is not None and "noise" in variant.components:
-                sigma_noise = noise_of_spectra(self.spectra[name], noise)
+                own_noise = sigma_noise * excess_noise(self.spectra[name], noise)
             for modes, excise in EXCISION.items():
                 spectrum = with_errors(
                     spherical_average(found, self.power, excise),
-                    noise=sigma_noise,
+                    noise=own_noise,
                     signal=signals[modes] if "eor" in variant.components else None,
                 )
                 save_spectrum(output / spectrum_file(name, modes), spectrum)
                 write_csv(output / f"{name}.{modes}.csv", spectrum)
-        return {"sigma_noise_mk2_h3_mpc3": 0.0 if noise is None else noise_level(read_delay_spectra(noise))}
+        return {"sigma_noise_mk2_h3_mpc3": sigma_noise}
 
     def _cost(self) -> Cost:
         baselines = size_of(self).baselines

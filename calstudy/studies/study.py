@@ -18,7 +18,7 @@ from rich.console import Console
 from calstudy.base.errors import InputError
 from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
-from calstudy.base.paths import blocks, texts
+from calstudy.base.paths import texts
 from calstudy.base.plugins import Registry
 from calstudy.base.schema import Section
 from calstudy.base.table import to_json
@@ -150,10 +150,10 @@ class Study(ABC):
     def folder(self) -> Path:
         """The run folder: the same study has the same one, and a changed study never overwrites it."""
         runs, content = self.outputs.runs.expanduser().resolve(), self.content
-        # Assumed values and those of a sweep are texts, of which some name files. For one that is too long to be one,
-        # methods of Path raise OSError.
-        found = [text for block in blocks(content, ("assumed", "sweep")) for text in texts(block)]
-        paths = [text for text in found if text.startswith("/") and (os.path.isfile(text) or os.path.isdir(text))]  # noqa: PTH112, PTH113
+        # Assumed values and those of a sweep are texts, of which some name files. For a text that is too long to be a
+        # path, methods of Path raise OSError.
+        found = (text for text in texts(content, below=("assumed", "sweep")) if text.startswith("/"))
+        paths = [text for text in found if os.path.isfile(text) or os.path.isdir(text)]  # noqa: PTH112, PTH113
         named = {path: identity(Path(path)) for path in paths}
         return runs / f"{self.name}-{digest_json([content, named] if named else content)[:8]}"
 

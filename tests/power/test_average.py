@@ -14,7 +14,7 @@ from calstudy.power.average import fringe_stop_and_average
 from calstudy.power.binned import noise_level
 from calstudy.power.settings import PowerSettings
 from calstudy.products.files import AVERAGE, write_visibilities
-from calstudy.products.spectra import Power, noise_of_spectra, read_delay_spectra
+from calstudy.products.spectra import Power, excess_noise, read_delay_spectra
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +117,8 @@ def test_spectra_of_data_that_lack_integrations_have_the_noise_of_those_that_are
         made.make(tmp_path / name / "power")
         power[name] = tmp_path / name / "power"
     expected = {name: noise_level(read_delay_spectra(folder)) for name, folder in power.items()}
-    assert noise_of_spectra(power["all"], power["all"]) == expected["all"]
-    ratio = noise_of_spectra(power["some"], power["all"]) / expected["all"]
+    assert excess_noise(power["all"], power["all"]) == 1
+    ratio = excess_noise(power["some"], power["all"])
     assert ratio == pytest.approx(np.sqrt(6 / 4 * 6 / 3))
     # 10 baselines and 32 delays, neighbouring ones correlated by the taper.
     assert expected["some"] / expected["all"] == pytest.approx(ratio, rel=0.2)

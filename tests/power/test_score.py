@@ -5,9 +5,14 @@ import itertools
 import numpy as np
 import pytest
 
+from calstudy.base.gains import make_uvcal
+from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.power.delay import delays
 from calstudy.power.score import CalibratedSpectra, Difference, difference, score
+from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra
+from calstudy.products.files import GAINS
+from calstudy.products.score import MeasureScore
 
 ANTENNAS = 16
 PAIRS = np.array(list(itertools.combinations(range(ANTENNAS), 2)))
@@ -128,3 +133,29 @@ def test_a_difference_is_of_the_baselines_that_both_have():
     found, expected = less((first, fewer)), less((both[0], both[1]))
     assert found.transfer == pytest.approx(expected.transfer, rel=1e-12)
     assert found.transfer_error == pytest.approx(expected.transfer_error, rel=1e-12)
+
+
+def test_errors_of_gains_are_those_of_all_polarizations(tmp_path, observe):
+    """Of a polarization that was fitted well, and one whose gains are all off by a fifth."""
+    template = observe(HexLayout(kind="hex", side=2), n_channels=16, polarizations=("xx", "yy"))
+    rng = np.random.default_rng(8)
+    true = 1 + 0.1 * rng.standard_normal((7, 16, 1, 2)) + 0.1j * rng.standard_normal((7, 16, 1, 2))
+    wrong = np.where(np.arange(2) == 1, 1.2, 1.0) * true
+    folders = {}
+    for name, gains in (("true", true), ("fitted", wrong)):
+        folders[name] = tmp_path / name
+        folders[name].mkdir()
+        make_uvcal(template, gains).write_calh5(folders[name] / GAINS)
+    task = dict.fromkeys(("signal", "response", "cross", "scale", "residual", "residual_without_eor"), tmp_path)
+    measured = MeasureScore(
+        "score",
+        **task,
+        power=PowerSettings(),
+        polarizations=2,
+        calibration={"even": folders["fitted"]},
+        data={},
+        calibration_without_eor={},
+        gains=folders["true"],
+    )
+    # Half of the antennas' errors are zero, and half a fifth.
+    assert measured._gain_errors()["gain_error_as_fitted"] == pytest.approx(0.1)
