@@ -1,4 +1,4 @@
-"""Detection of TensorFlow, and its import without start-up messages and without Keras."""
+"""Libraries without their messages: TensorFlow's at its import, also without Keras, and warnings of others."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -56,6 +57,16 @@ def _without_keras() -> Iterator[None]:
     finally:
         if not given:
             del os.environ[KERAS]
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Ignore warnings within the block, such as those of a library that divides by zero, and replaces the result."""
+    import numpy as np
+
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        yield
 
 
 def write_errors_to(path: Path) -> None:

@@ -40,18 +40,10 @@ class Bucket:
     members: np.ndarray
     vectors: np.ndarray
 
-    @property
-    def n_coefficients(self) -> int:
-        """Number of complex coefficients of all members together."""
-        return self.vectors.shape[1] * self.members.size
-
 
 @dataclass(frozen=True, eq=False)
 class ForegroundBasis:
-    """The bases of all foreground models (one model per baseline, or one per redundant group).
-
-    A model is one spectrum, and belongs to exactly one bucket.
-    """
+    """The bases of all foreground models: of baselines, or redundant groups. Each belongs to exactly one bucket."""
 
     buckets: tuple[Bucket, ...]
     n_models: int
@@ -60,7 +52,7 @@ class ForegroundBasis:
     @property
     def n_coefficients(self) -> int:
         """Number of complex coefficients of all models together."""
-        return sum(bucket.n_coefficients for bucket in self.buckets)
+        return sum(bucket.vectors.shape[1] * bucket.members.size for bucket in self.buckets)
 
 
 def delay_half_widths(lengths: np.ndarray, settings: BasisSettings) -> np.ndarray:
@@ -158,13 +150,6 @@ def restrict(vectors: np.ndarray, grid: ChannelGrid, eigenvalue_cutoff: float = 
     return np.ascontiguousarray(left[:, singular**2 > eigenvalue_cutoff])
 
 
-def _model_vectors(grid: ChannelGrid, half_bandwidth: float, prior: bool) -> np.ndarray:
-    """Return the vectors of foreground models on the channels that exist; see `make_basis`."""
-    if prior:
-        return flat_wedge_root(grid.n_channels, half_bandwidth)[grid.positions]
-    return restrict(dpss_vectors(grid.n_channels, half_bandwidth), grid)
-
-
 WHOLE_BAND = slice(None)
 
 
@@ -199,14 +184,9 @@ def make_basis(
     Raises InputError if channels do not lie on an even grid, a half-width is zero, or a basis has as many vectors as
     there are channels.
 
-    Parameters
-    ----------
-    lengths : baseline length of each model in m, shape (Nmodels,); zero for autocorrelations
-    frequencies : channel centres in Hz on an even grid, gaps allowed, shape (Nfreqs,)
-    prior
-        Use a root of the covariance of a flat wedge with variance one per channel (see `flat_wedge_root`) in place of
-        orthonormal vectors.
-    band : the channels that foregrounds are modelled in; vectors are zero in the others
+    Lengths are in m, (Nmodels,), zero for autocorrelations; channel centres in Hz, (Nfreqs,), with gaps or without.
+    With a `prior`, vectors are a root of the covariance of a flat wedge (`flat_wedge_root`) and not orthonormal. They
+    are zero in channels outside of the band.
     """
     grid = _grid_of(frequencies, band)
     width, n_modelled = grid.width, len(grid.positions)
@@ -215,8 +195,10 @@ def make_basis(
     for half_width in np.unique(half_widths):
         if half_width <= 0:
             raise InputError("calibration.basis: the delay half-width is 0 s; set min_delay or buffer above zero")
-        product = half_width * width
-        vectors = _model_vectors(grid, grid.n_channels * product, prior) if product < 0.5 else None
+        product, vectors = half_width * width, None
+        if product < 0.5:
+            size = grid.n_channels, grid.n_channels * product
+            vectors = flat_wedge_root(*size)[grid.positions] if prior else restrict(dpss_vectors(*size), grid)
         if vectors is None or vectors.shape[1] >= n_modelled:
             raise InputError(
                 f"calibration.basis: a delay half-width of {half_width * 1e9:.0f} ns fills all {n_modelled} "
@@ -231,10 +213,12 @@ def make_basis(
 
 
 def require_room(length: float, frequencies: np.ndarray, settings: BasisSettings) -> None:
-    """Raise InputError if a baseline of this length, in m, cannot have a foreground basis; see `make_basis`."""
-    grid = channel_grid(np.asarray(frequencies, float))
-    product = delay_half_widths(np.array([length]), settings)[0] * grid.width
-    # A plan is faster where the sequences, and scipy.signal for them, are not needed to see that there is room.
-    if 0 < product < 0.5 and _most_sequences(grid.n_channels, grid.n_channels * product) < len(frequencies):
-        return
-    make_basis(np.array([length]), frequencies, settings)
+    """Raise InputError if the longest baseline, of this length in m, cannot have a basis; see `make_basis`."""
+    try:
+        grid = channel_grid(np.asarray(frequencies, float))
+        product = delay_half_widths(np.array([length]), settings)[0] * grid.width
+        # A plan is faster where the sequences, and scipy.signal for them, are not needed to see that there is room.
+        if not 0 < product < 0.5 or _most_sequences(grid.n_channels, grid.n_channels * product) >= len(frequencies):
+            make_basis(np.array([length]), frequencies, settings)
+    except InputError as error:
+        raise InputError(f"{error} (the longest baseline has {length:.0f} m)") from None

@@ -7,7 +7,6 @@ losses, but for what all blocks of a board have in common.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
+from calstudy.base.quiet import without_warnings
 from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Frequency
 from calstudy.base.visibilities import channels_per_block
@@ -122,9 +122,7 @@ class Boards(Section):
         names = [(a, f"J{p}") for a in range(len(gains)) for p in range(gains.shape[3])]
         spectra, weights = ({(a, feed): v[a, :, :, int(feed[1:])].T for a, feed in names} for v in (gains, information))
         try:
-            with warnings.catch_warnings(), np.errstate(all="ignore"):
-                # hera_cal divides by what may be zero, and replaces it.
-                warnings.simplefilter("ignore")
+            with without_warnings():
                 found, _ = estimate_SNAP_decoherence(
                     spectra,
                     weights,

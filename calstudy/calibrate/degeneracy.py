@@ -11,11 +11,15 @@ Gains multiplied by smooth functions, which the model compensates, are only near
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
+
+POL, FEED = "nn", "Jnn"
+"""Names that hera_cal wants for the polarization, and for its feed; each polarization is calibrated by itself."""
 
 
 def fix_phase(gains: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -100,6 +104,22 @@ def fix_degeneracies(
         reference = np.where(problem.antenna_weights > 0, problem.initial_gains, 0)
         turned = fix_phase(gains.reshape(-1, 1), reference.reshape(-1, 1)).reshape(gains.shape)
     return turned / np.sqrt(scale), model * scale
+
+
+def gradient_turns(
+    reds: Sequence[Sequence[tuple[int, int, str]]], overlap: Mapping[tuple[int, int, str], np.ndarray]
+) -> dict[tuple[int, str], np.ndarray]:
+    """Return the phase factors of antennas with the phase gradient that brings redundant groups closest to a sky model.
+
+    `overlap` are weighted calibrated data times the conjugate of the sky model, (Ntimes, Nfreqs), of each baseline, in
+    the terms of hera_cal; all that the gradient depends on are the sums over each group.
+    """
+    from hera_cal.abscal import complex_phase_abscal
+    from hera_cal.datacontainer import DataContainer
+
+    sums = {group[0]: sum(overlap[key] for key in group) for group in reds}
+    ones = {key: np.ones_like(values) for key, values in sums.items()}
+    return complex_phase_abscal(DataContainer(sums), DataContainer(ones), reds, list(sums), list(sums))[1]
 
 
 def align(gains: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, float]:

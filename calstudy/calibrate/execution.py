@@ -5,10 +5,10 @@ Mistakes of a user's own calibrator are reported as InputError with its name; th
 
 from __future__ import annotations
 
-import math
-import warnings
+import itertools
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -19,6 +19,7 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.plugins import FILE_REFERENCE, guarded
+from calstudy.base.quiet import without_warnings
 from calstudy.base.resources import Cost, Usage
 from calstudy.base.visibilities import positions
 from calstudy.calibrate.basis import channel_grid, dpss_vectors, restrict
@@ -30,8 +31,9 @@ from calstudy.calibrate.interface import (
     PolynomialSmoothing,
     Progress,
     SmoothCal,
-    Smoothing,
+    SmoothGains,
 )
+from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.records import CalibrationResult, Solve, Status, make_gains, make_visibilities
 from calstudy.instrument.settings import Size
 
@@ -43,32 +45,30 @@ EIGENVALUE_CUTOFF = 1e-9
 """Sequences with a smaller concentration are left out, as hera_cal does."""
 
 
-def smooth(
-    gains: np.ndarray, flags: np.ndarray, data: Observation, numbers: np.ndarray, settings: Smoothing
-) -> np.ndarray:
+def smooth(gains: np.ndarray, flags: np.ndarray, data: Observation, settings: SmoothGains) -> np.ndarray:
     """Smooth gains, (Nants, Nfreqs, Ntimes, Npols); flagged ones have no influence and stay as they are.
 
-    Channels and integrations are those of `data`; `numbers` are those of the antennas, (Nants,). Raises InputError if
-    the reference antenna has no gains, or if channels or integrations are not even where they must be, or too few.
+    Antennas, channels and integrations are those of `data`. Raises InputError if the reference antenna has no gains, or
+    if channels or integrations are not even where they must be, or too few.
     """
     values = np.where(flags, 0, gains)
     if settings.reference_antenna is not None:
-        if settings.reference_antenna not in numbers:
+        if settings.reference_antenna not in data.numbers:
             raise _fault(f"reference_antenna: there is no antenna {settings.reference_antenna} in the data")
-        reference = values[np.flatnonzero(numbers == settings.reference_antenna)[0]]
+        reference = values[np.flatnonzero(data.numbers == settings.reference_antenna)[0]]
         if ((reference == 0) & ~flags.all(axis=0)).any():
             raise _fault(f"reference_antenna: antenna {settings.reference_antenna} is flagged where others are not")
         values = values * np.exp(-1j * np.angle(reference))
-    smoothed = values.copy()
     if isinstance(settings, SmoothCal):
         if len(data.times) < 2:
             raise _fault("smooth-cal smooths over time, and there is a single integration")
-        for a, p in np.argwhere(~flags.all(axis=(1, 2))):
-            smoothed[a, :, :, p] = _smooth_cal(values[a, :, :, p].T, flags[a, :, :, p].T, data, settings).T
+        one = partial(_smooth_cal, data=data, settings=settings)
     else:
         in_frequency, in_time = _vectors(settings, data)
-        for a, p in np.argwhere(~flags.all(axis=(1, 2))):
-            smoothed[a, :, :, p] = fit(values[a, :, :, p], ~flags[a, :, :, p], in_frequency, in_time)
+        one = partial(fit, in_frequency=in_frequency, in_time=in_time)
+    smoothed = values.copy()
+    for a, p in np.argwhere(~flags.all(axis=(1, 2))):
+        smoothed[a, :, :, p] = one(values[a, :, :, p], ~flags[a, :, :, p])
     return np.where(flags, gains, smoothed)
 
 
@@ -99,16 +99,15 @@ def _fault(sentence: str) -> InputError:
     return InputError(f"calibration.smooth_gains: {sentence}")
 
 
-def _vectors(settings: Smoothing, data: Observation) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _vectors(
+    settings: DpssSmoothing | PolynomialSmoothing, data: Observation
+) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Return orthonormal functions of frequency (Nfreqs, Nf) and of time (Ntimes, Nt), None for all."""
-    seconds = (data.times - data.times[0]) * SECONDS_PER_DAY
+    frequencies, seconds = data.frequencies, (data.times - data.times[0]) * SECONDS_PER_DAY
     if isinstance(settings, PolynomialSmoothing):
-        return _polynomials(data.frequencies, settings.frequency_degree), _polynomials(seconds, settings.time_degree)
-    assert isinstance(settings, DpssSmoothing)
-    return (
-        _sequences(data.frequencies, settings.frequency_scale, "channels"),
-        _sequences(seconds, settings.time_scale, "integrations"),
-    )
+        return _polynomials(frequencies, settings.frequency_degree), _polynomials(seconds, settings.time_degree)
+    scales = settings.frequency_scale, settings.time_scale
+    return _sequences(frequencies, scales[0], "channels"), _sequences(seconds, scales[1], "integrations")
 
 
 def _polynomials(x: np.ndarray, degree: int | None) -> np.ndarray | None:
@@ -158,31 +157,29 @@ def _weighted(values: np.ndarray, used: np.ndarray, functions: np.ndarray) -> np
     if not used.any():
         return values
     # Functions that are degenerate on the used samples get the combination of minimum norm.
-    normal = functions[used].T @ functions[used]
-    return functions @ (
-        np.linalg.pinv(normal, rcond=EIGENVALUE_CUTOFF, hermitian=True) @ (functions[used].T @ values[used])
-    )
+    kept = functions[used]
+    inverse = np.linalg.pinv(kept.T @ kept, rcond=EIGENVALUE_CUTOFF, hermitian=True)
+    return functions @ (inverse @ (kept.T @ values[used]))
 
 
-def _smooth_cal(gains: np.ndarray, flags: np.ndarray, data: Observation, settings: SmoothCal) -> np.ndarray:
-    """Smooth gains (Ntimes, Nfreqs) as hera_cal does."""
+def _smooth_cal(values: np.ndarray, used: np.ndarray, data: Observation, settings: SmoothCal) -> np.ndarray:
+    """Smooth the used values, (Nfreqs, Ntimes), as hera_cal does."""
     from hera_cal.smooth_cal import time_freq_2D_filter
 
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # hera_cal divides by what may be zero, and replaces it.
-        warnings.simplefilter("ignore")
+    with without_warnings():
         found, _ = time_freq_2D_filter(
-            gains,
-            (~flags).astype(float),
+            values.T,
+            used.T.astype(float),
             data.frequencies,
             data.times,
             freq_scale=settings.frequency_scale / 1e6,
             time_scale=settings.time_scale,
             method="DPSS",
         )
-    if not (np.isfinite(found) & (found != 0) | flags).all() or not math.isfinite(np.abs(found[~flags]).max()):
+    smoothed = np.asarray(found).T
+    if not np.isfinite(smoothed[used]).all() or not smoothed[used].all():
         raise _fault("smooth-cal left gains that are not finite")
-    return np.asarray(found)
+    return smoothed
 
 
 def require_calibratable(calibrator: Calibrator, frame: Frame, has_sky_model: bool) -> None:
@@ -216,23 +213,17 @@ def run_calibrator(
     Raises InputError if the data or the sky model cannot be used, the calibrator refuses them, or a user's calibrator
     fails or returns an invalid calibration.
 
-    Parameters
-    ----------
-    calibrator : any calibrator, built in or a user's
-    data : visibilities, rectangular and time-major; not changed
-    sky_model : visibilities of the known part of the sky, with the samples of `data`, or None; not changed
-    gains : gains to start from, for an iterative calibrator; None for the calibrator's own start
-    progress : called after each solve with the number done and the total
-    noise : standard deviation of the noise of a sample (see `Assumed`); None if it is not known
+    Data, and the sky model if there is one, with the samples of the data, are rectangular and time-major; they are not
+    changed. For gains to start from and `noise` see `Assumed`.
     """
     observation = Observation(data)
-    assumed = Assumed(None if sky_model is None else Observation(sky_model), gains, noise)
-    if assumed.sky_model is not None:
-        _require_usable(assumed.sky_model, observation)
-    require_calibratable(calibrator, observation, assumed.sky_model is not None)
+    sky = None if sky_model is None else Observation(sky_model)
+    if sky is not None:
+        _require_usable(sky, observation)
+    require_calibratable(calibrator, observation, sky is not None)
     with Usage() as usage, guarded(calibrator):
-        returned = calibrator.calibrate(observation, assumed, progress)
-    return _Returned(calibrator, returned, observation, assumed).result(usage)
+        returned = calibrator.calibrate(observation, Assumed(sky, gains, noise), progress)
+    return _Returned(calibrator, returned, observation, sky).result(usage)
 
 
 def _require_usable(sky_model: Observation, data: Observation) -> None:
@@ -261,28 +252,22 @@ class _Returned:
     """A checked calibration; mistakes of a user's calibrator raise InputError, those of a built-in one ValueError."""
 
     def __init__(
-        self, calibrator: Calibrator, returned: Calibration, observation: Observation, assumed: Assumed
+        self, calibrator: Calibrator, returned: Calibration, observation: Observation, sky_model: Observation | None
     ) -> None:
-        self.calibrator, self.returned = calibrator, returned
-        self.sky_model = None if assumed.sky_model is None else assumed.sky_model.uvd
+        self.calibrator, self.returned, self.sky_model = calibrator, returned, sky_model
         self._require(isinstance(returned, Calibration), f"returns {type(returned).__name__}, not a Calibration")
         self.groups = calibrator.solves(observation.n_times)
         self.fitted = observation
         if returned.baselines is not None:
             shape = (observation.n_baselines,)
             self.fitted = observation.baselines(self._mask("baselines", returned.baselines, shape, least=1))
-        self.numbers, self.gains, self.gain_flags = self._gains()
-        self.closure = self._closure()
-        self.model = self._model(assumed)
-        self.outcomes = self._outcomes()
+        self.gains, self.gain_flags = self._gains()
+        self.closure, self.model, self.outcomes = self._closure(), self._model(), self._outcomes()
 
     def _require(self, condition: bool, sentence: str) -> None:
         if not condition:
-            raise self._fault(sentence)
-
-    def _fault(self, sentence: str) -> ValueError:
-        kind = ValueError if self.calibrator.is_built_in else InputError
-        return kind(f"{_where(self.calibrator)}: {sentence}")
+            kind = ValueError if self.calibrator.is_built_in else InputError
+            raise kind(f"{_where(self.calibrator)}: {sentence}")
 
     def _mask(self, name: str, values: np.ndarray, shape: tuple[int, ...], least: int = 0) -> np.ndarray:
         """Return a mask of the calibration, bool, which must have this shape and at least so many marks."""
@@ -294,13 +279,14 @@ class _Returned:
         )
         return mask
 
-    def _gains(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return antenna numbers, gains and their flags, (Nants, Nfreqs, Ntimes, Npols)."""
-        numbers, gains, flags = self.fitted.numbers, self.returned.gains, self.returned.gain_flags
+    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return gains and their flags, (Nants, Nfreqs, Ntimes, Npols)."""
+        gains, flags = self.returned.gains, self.returned.gain_flags
         if not isinstance(gains, np.ndarray):
-            numbers, gains, flags = self._from_uvcal(gains, flags)
-        n_times, n_channels, n_polarizations = self.fitted.n_times, self.fitted.n_channels, self.fitted.n_polarizations
-        shapes = [(len(numbers), n_channels, count, n_polarizations) for count in (n_times, len(self.groups))]
+            gains, flags = self._from_uvcal(gains, flags)
+        n_times, _, n_channels, n_polarizations = self.fitted.shape
+        counts = n_times, len(self.groups)
+        shapes = [(self.fitted.n_antennas, n_channels, count, n_polarizations) for count in counts]
         self._require(
             gains.shape in shapes and gains.dtype.kind in "cfiu",
             f"returns gains of shape {gains.shape} and type {gains.dtype}, expected complex numbers of shape "
@@ -316,9 +302,9 @@ class _Returned:
         if gains.shape[2] != n_times:
             lengths = [group.stop - group.start for group in self.groups]
             gains, flags = np.repeat(gains, lengths, axis=2), np.repeat(flags, lengths, axis=2)
-        return numbers, np.where(flags, 1, gains).astype(complex), flags.copy()
+        return np.where(flags, 1, gains).astype(complex), flags.copy()
 
-    def _from_uvcal(self, gains: UVCal, flags: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _from_uvcal(self, gains: UVCal, flags: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         from pyuvdata import UVCal
 
         self._require(
@@ -332,22 +318,20 @@ class _Returned:
         missing = sorted(set(self.fitted.numbers.tolist()) - set(gains.ant_array.tolist()))
         self._require(not missing, f"returns no gains for antenna {missing[0] if missing else ''}")
         rows = positions(gains.ant_array, self.fitted.numbers)
-        flagged = gains.flag_array[rows] if flags is None else flags
-        return self.fitted.numbers, gains.gain_array[rows], flagged
+        return gains.gain_array[rows], gains.flag_array[rows] if flags is None else flags
 
-    def _model(self, assumed: Assumed) -> np.ndarray:
-        model, sky_model, shape = self.returned.model, assumed.sky_model, self.fitted.shape
-        if model is None:
-            if sky_model is None:
-                raise self._fault("returns no model, and there is no sky model in its place")
-            if self.returned.baselines is not None:
-                sky_model = sky_model.baselines(np.asarray(self.returned.baselines))
-            model = sky_model.visibilities
+    def _model(self) -> np.ndarray:
+        model, sky_model, shape = self.returned.model, self.sky_model, self.fitted.shape
+        if model is None and sky_model is not None:
+            chosen = self.returned.baselines
+            model = (sky_model if chosen is None else sky_model.baselines(np.asarray(chosen))).visibilities
+        self._require(model is not None, "returns no model, and there is no sky model in its place")
         self._require(
             isinstance(model, np.ndarray) and model.shape == shape,
             f"returns a model of shape {getattr(model, 'shape', None)}, expected {shape} (integrations, baselines, "
             "channels, polarizations), or None for the sky model",
         )
+        assert model is not None, "required above"
         finite = bool((np.isfinite(model) | self.fitted.flags).all())
         self._require(finite, "returns a model that is not finite for unflagged data")
         return model
@@ -391,66 +375,62 @@ class _Returned:
         flags = np.array(self.fitted.flags)
         if self.returned.flags is not None:
             flags |= self._mask("flags", self.returned.flags, flags.shape)
-        for index, outcome in enumerate(self.outcomes):
+        solves = itertools.product(range(self.fitted.n_polarizations), self.groups)
+        for outcome, (p, times) in zip(self.outcomes, solves, strict=True):
             if not outcome.usable:
-                p, group = divmod(index, len(self.groups))
-                flags[self.groups[group], :, :, p] = True
+                flags[times, :, :, p] = True
         self.gain_flags |= ~self.fitted.antennas_of(np.moveaxis(~flags, 0, 2))
         gains = np.where(self.gain_flags, 1, self.gains)
         smoothing = self.calibrator.smooth_gains
         if smoothing is not None:
             if smoothing.reference_antenna is None:
                 gains = np.where(self.gain_flags, 1, smoothly_turned(np.where(self.gain_flags, 0, gains)))
-            gains = smooth(gains, self.gain_flags, self.fitted, self.numbers, smoothing)
+            gains = smooth(gains, self.gain_flags, self.fitted, smoothing)
         residual = self._residual(gains, flags)
         template = self.fitted.uvd
         model = self.model if self.closure is None else self.closure * self.model
         result = CalibrationResult(
-            make_gains(template, self.numbers, gains, self.gain_flags),
+            make_gains(template, self.fitted.numbers, gains, self.gain_flags),
             make_visibilities(template, model, flags),
             make_visibilities(template, residual, flags),
             tuple(self._records(usage)),
         )
-        sky = self.sky_model
+        sky = None if self.sky_model is None else self.sky_model.uvd
         if sky is not None and str(sky.vis_units).lower() == "jy" and self.calibrator.on_sky_scale:
-            result.gains.gain_scale, result.gains.pol_convention = sky.vis_units, sky.pol_convention
-            for uvd in (result.model, result.residual):
-                uvd.vis_units, uvd.pol_convention = sky.vis_units, sky.pol_convention
+            result.gains.gain_scale = result.model.vis_units = result.residual.vis_units = sky.vis_units
+            for found in (result.gains, result.model, result.residual):
+                found.pol_convention = sky.pol_convention
         return result
 
     def _residual(self, gains: np.ndarray, flags: np.ndarray) -> np.ndarray:
         """Compute V / (c_ab g_a g_b*) - F, zero where flagged, and add the flags of the gains to `flags`."""
         residual = np.zeros(self.fitted.shape, complex)
-        first, second = np.searchsorted(self.numbers, self.fitted.pairs).T
-        for t in range(self.fitted.n_times):
-            for p in range(self.fitted.n_polarizations):
-                flagged = self.gain_flags[:, :, t, p]
-                flags[t, :, :, p] |= flagged[first] | flagged[second]
-                unused = flags[t, :, :, p]
-                products = gains[first, :, t, p] * gains[second, :, t, p].conj()
-                if self.closure is not None:
-                    products = self.closure[t, :, :, p] * products
-                calibrated = np.where(unused, 0, self.fitted.visibilities[t, :, :, p]) / products
-                residual[t, :, :, p] = np.where(unused, 0, calibrated - self.model[t, :, :, p])
+        first, second = self.fitted.antennas.T
+        for t, p in np.ndindex(self.fitted.n_times, self.fitted.n_polarizations):
+            flagged = self.gain_flags[:, :, t, p]
+            flags[t, :, :, p] |= flagged[first] | flagged[second]
+            unused = flags[t, :, :, p]
+            products = gain_products(gains[:, :, t, p], self.fitted.antennas)
+            if self.closure is not None:
+                products = self.closure[t, :, :, p] * products
+            calibrated = np.where(unused, 0, self.fitted.visibilities[t, :, :, p]) / products
+            residual[t, :, :, p] = np.where(unused, 0, calibrated - self.model[t, :, :, p])
         return residual
 
     def _records(self, usage: Usage) -> list[Solve]:
         share, cpu_share = (value / len(self.outcomes) for value in (usage.seconds, usage.cpu_seconds))
-        found = []
-        for index, outcome in enumerate(self.outcomes):
-            p, group = divmod(index, len(self.groups))
-            times = self.groups[group]
-            found.append(
-                replace(
-                    outcome,
-                    loss_history=np.asarray(outcome.loss_history, float),
-                    seconds=share if outcome.seconds is None else outcome.seconds,
-                    cpu_seconds=cpu_share if outcome.cpu_seconds is None else outcome.cpu_seconds,
-                    peak_memory=usage.peak_memory if outcome.peak_memory is None else outcome.peak_memory,
-                    integration=times.start,
-                    n_integrations=times.stop - times.start,
-                    time=float(self.fitted.times[times.start]),
-                    polarization=int(self.fitted.polarizations[p]),
-                )
+        solves = itertools.product(self.fitted.polarizations, self.groups)
+        return [
+            replace(
+                outcome,
+                loss_history=np.asarray(outcome.loss_history, float),
+                seconds=share if outcome.seconds is None else outcome.seconds,
+                cpu_seconds=cpu_share if outcome.cpu_seconds is None else outcome.cpu_seconds,
+                peak_memory=usage.peak_memory if outcome.peak_memory is None else outcome.peak_memory,
+                integration=times.start,
+                n_integrations=times.stop - times.start,
+                time=float(self.fitted.times[times.start]),
+                polarization=int(polarization),
             )
-        return found
+            for outcome, (polarization, times) in zip(self.outcomes, solves, strict=True)
+        ]

@@ -49,6 +49,8 @@ class Assumed:
     noise: float | None = None
 
 
+NO_SKY_MODEL = "needs a sky model, and there is none"
+
 Outcome = Solve
 """The former name of `Solve`, for existing plug-ins."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import warnings
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,9 +13,12 @@ from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import closest_solutions, gains_for
 from calstudy.base.observation import Observation
+from calstudy.base.quiet import without_warnings
+from calstudy.calibrate.degeneracy import FEED, POL, gradient_turns
 from calstudy.calibrate.delay_start import delay_start
 from calstudy.calibrate.interface import Assumed
 from calstudy.calibrate.problem import (
+    NOTHING_WEIGHTED,
     CalibrationProblem,
     FitStructure,
     fitted_baselines,
@@ -25,7 +28,7 @@ from calstudy.calibrate.problem import (
 )
 from calstudy.calibrate.records import Solve, require_parallel_hands
 from calstudy.calibrate.settings import RUNAWAY, START_DEVIATION, ForegroundFit, GainFit, GainWeights, RedundantStart
-from calstudy.calibrate.weights import inverse_variances, make_weights
+from calstudy.calibrate.weights import inverse_variances, make_weights, require_finite
 from calstudy.instrument.layouts import redundant_groups
 
 NOTHING = Assumed()
@@ -35,21 +38,12 @@ NOTHING = Assumed()
 class PreparedFit:
     """The arrays of a fit, of all integrations.
 
-    Attributes
-    ----------
-    data
-        The calibrated visibilities: without the autocorrelations, unless they are fitted. Indices of antennas in the
-        structure are those of `data.numbers`.
-    fitted : mask of these baselines in the observation, bool, (Nbls,)
-    structure : structure of the fit of one integration that has data at both ends of the band
-    weights
-        Shape (Ntimes, Nbls, Nfreqs, Npols). Inverse variances if the foregrounds have a finite prior. Weights that
-        come from the gains are those of unity gains.
-    used
-        Mask of the calibrated samples, bool, of the same shape: all unflagged samples with weight, also on baselines
-        outside the range to which gains are fitted.
-    start : gains to start from, (Nants, Nfreqs, Ntimes, Npols)
-    sky : the sky model like the visibilities, or None
+    Data are the calibrated visibilities: without the autocorrelations, unless they are fitted; `fitted` is the mask of
+    these baselines in the observation, bool, (Nbls,). Indices of antennas in the structure, which is that of an
+    integration with data at both ends of the band, are those of `data.numbers`. Weights, (Ntimes, Nbls, Nfreqs, Npols),
+    are inverse variances if the foregrounds have a finite prior, and those of unity gains if they come from the gains.
+    Samples that are `used`, bool, of the same shape, are all unflagged ones with weight, also on baselines outside the
+    range to which gains are fitted. Gains to start from are (Nants, Nfreqs, Ntimes, Npols).
     """
 
     data: Observation
@@ -90,7 +84,7 @@ def prepare(observation: Observation, settings: GainFit, assumed: Assumed = NOTH
     if settings.baselines is not None:
         weights = weights * settings.baselines.factors(data.lengths, data.antennas)[:, None, None]
     sky = None if assumed.sky_model is None else assumed.sky_model.baselines(fitted).visibilities
-    _require_finite(data)
+    require_finite(data)
     structure = make_structure(data, settings)
     gains = assumed.gains
     if gains is None and settings.initial_gains.kind == "file":
@@ -143,7 +137,7 @@ def make_problem(prepared: PreparedFit, settings: GainFit, times: slice, polariz
     weights, visibilities = rows(prepared.weights), rows(prepared.data.visibilities)
     with_data = np.flatnonzero(weights.any(axis=0))
     if not with_data.size:
-        return "every sample is flagged or has no weight"
+        return NOTHING_WEIGHTED
     try:
         one = prepared.structure_between(int(with_data[0]), int(with_data[-1]) + 1, settings)
     except InputError as error:
@@ -178,25 +172,11 @@ def _deviations(sky: np.ndarray | None, weights: np.ndarray, settings: GainFit) 
     if not isinstance(settings, ForegroundFit) or not settings.foreground_prior.finite or sky is None:
         return math.inf, math.inf
     prior, rms = settings.foreground_prior, model_rms(sky, weights)
-    given = [
-        START_DEVIATION if value == "estimated" else float(value) for value in (prior.deviation, prior.shared_deviation)
-    ]
-    return given[0] * rms, given[1] * rms
+    given = prior.deviation, prior.shared_deviation
+    own, shared = (START_DEVIATION if value == "estimated" else float(value) for value in given)
+    return own * rms, shared * rms
 
 
-def _require_finite(data: Observation) -> None:
-    bad = ~(np.isfinite(data.visibilities) | data.flags)
-    if bad.any():
-        t, baseline, channel, _ = np.argwhere(bad)[0]
-        a, b = data.pairs[baseline]
-        raise InputError(
-            f"{bad.sum()} unflagged visibilities are not finite, the first on baseline ({a}, {b}), integration {t}, "
-            f"channel {channel}; flag them"
-        )
-
-
-# hera_cal wants a name for the polarization; solves are one polarization at a time.
-POL = "nn"
 Key = tuple[int, int, str]
 """A baseline and a polarization, as in hera_cal."""
 
@@ -232,16 +212,16 @@ def redundant_start(
     by less than `tolerance`, in m, are redundant. Gains are unity for antennas without redundant baselines, and where
     the solution is not finite. Raises InputError if no two baselines are redundant.
     """
-    pairs, groups = data.pairs, redundant_groups(data.vectors, tolerance)
+    groups = redundant_groups(data.vectors, tolerance)
     members = [np.flatnonzero(groups.index == group) for group in range(groups.index.max() + 1)]
-    members = [rows for rows in members if rows.size > 1 and pairs[rows[0], 0] != pairs[rows[0], 1]]
+    members = [rows for rows in members if rows.size > 1 and not data.autos[rows[0]]]
     if not members:
         raise InputError(
             "calibration.initial_gains: 'redundant' needs redundant baselines, and no two differ by less than "
             f"redundancy_tolerance = {tolerance:g} m; start from unity or a file"
         )
-    ends = np.where(groups.conjugated[:, None], pairs[:, ::-1], pairs).tolist()
-    keys = {row: (ends[row][0], ends[row][1], POL) for rows in members for row in rows.tolist()}
+    ends = np.where(groups.conjugated[:, None], data.pairs[:, ::-1], data.pairs).tolist()
+    keys = {row: (*ends[row], POL) for rows in members for row in rows.tolist()}
     reds = [[keys[row] for row in rows.tolist()] for rows in members]
     gains = np.ones((data.n_antennas, data.n_channels, data.n_times, data.n_polarizations), complex)
     for p in range(data.n_polarizations):
@@ -251,14 +231,18 @@ def redundant_start(
         visibilities = {key: np.where(used[key] > 0, values, 1) for key, values in measured.items()}
         solved = _solve(reds, visibilities, used, data.frequencies, settings.delays)
         if sky is not None:
-            model = _turned(sky[..., p], keys, groups.conjugated)
+            model = _turned(np.nan_to_num(sky[..., p]), keys, groups.conjugated)
             overlap = {
-                key: used[key] * values * np.nan_to_num(model[key]).conj() for key, values in visibilities.items()
+                (a, b, pol): used[a, b, pol] * values * model[a, b, pol].conj() * solved[a].conj() * solved[b]
+                for (a, b, pol), values in visibilities.items()
             }
-            solved = _along_sky(reds, overlap, solved)
-        for row, number in enumerate(data.numbers):
-            if int(number) in solved:
-                gains[row, :, :, p] = solved[int(number)].T
+            with without_warnings():
+                turns = {a: turn for (a, _), turn in gradient_turns(reds, overlap).items()}
+            solved = {
+                a: gain * np.where(np.isfinite(turns[a]) & (turns[a] != 0), turns[a], 1) for a, gain in solved.items()
+            }
+        for number, gain in solved.items():
+            gains[np.searchsorted(data.numbers, number), :, :, p] = gain.T
     return np.where(np.isfinite(gains) & (gains != 0), gains, 1)
 
 
@@ -280,37 +264,11 @@ def _solve(
 
     calibrator = RedundantCalibrator(reds)
     data = DataContainer(visibilities)
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # Channels without data make singular equations; their gains are replaced by unity.
-        warnings.simplefilter("ignore")
-        first = calibrator.firstcal(data, frequency)[1].gains if delays else {}
+    # Channels without data make singular equations; their gains are replaced by unity.
+    with without_warnings():
+        first = calibrator.firstcal(data, frequency)[1].gains if delays else defaultdict(lambda: np.ones(1))
         # Degeneracies are fixed where phases are small: elsewhere they may jump by a lattice's worth between channels.
-        rest = {key: values / _product(first, key, values) for key, values in data.items()}
+        rest = {(a, b, pol): values / (first[a, FEED] * first[b, FEED].conj()) for (a, b, pol), values in data.items()}
         _, solution = calibrator.logcal(DataContainer(rest), wgts=DataContainer(weights))
         solution.remove_degen(degen_sol={antenna: np.ones_like(gain) for antenna, gain in solution.gains.items()})
-    return {key[0]: np.asarray(gain * first.get(key, 1), complex) for key, gain in solution.gains.items()}
-
-
-def _along_sky(
-    reds: list[list[Key]], overlap: dict[Key, np.ndarray], gains: dict[int, np.ndarray]
-) -> dict[int, np.ndarray]:
-    """Return gains with the phase gradient of the sky model; `overlap` are weighted data times its conjugate."""
-    from hera_cal.abscal import complex_phase_abscal
-    from hera_cal.datacontainer import DataContainer
-
-    # All that the gradient depends on: the sum over each group.
-    heads = {group[0]: sum(overlap[key] * gains[key[0]].conj() * gains[key[1]] for key in group) for group in reds}
-    ones = {key: np.ones_like(values) for key, values in heads.items()}
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        _, turns = complex_phase_abscal(DataContainer(heads), DataContainer(ones), reds, list(heads), list(heads))
-    known = {antenna: np.where(np.isfinite(turn) & (turn != 0), turn, 1) for (antenna, _), turn in turns.items()}
-    return {antenna: gain * known.get(antenna, 1) for antenna, gain in gains.items()}
-
-
-def _product(gains: dict[tuple[int, str], np.ndarray], key: Key, like: np.ndarray) -> np.ndarray:
-    """Return g_a g_b* of a baseline; unity if there are no gains."""
-    from hera_cal.utils import split_bl
-
-    first, second = split_bl(key)
-    return gains.get(first, np.ones_like(like)) * np.conj(gains.get(second, np.ones_like(like)))
+    return {key[0]: np.asarray(gain * first[key], complex) for key, gain in solution.gains.items()}

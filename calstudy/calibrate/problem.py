@@ -7,7 +7,7 @@ import math
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -15,10 +15,12 @@ from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame
 from calstudy.calibrate.basis import WHOLE_BAND, Bucket, ForegroundBasis, gain_vectors, make_basis
 from calstudy.calibrate.settings import MODELS_AT_ONCE, ForegroundFit, GainFit
-from calstudy.instrument.layouts import redundant_groups
+from calstudy.instrument.layouts import RedundantGroups, redundant_groups
 
+NOTHING_WEIGHTED = "every sample is flagged or has no weight"
 LARGEST_WEIGHT = 100.0
 """Of weights from gains, over that of the median of |g_a g_b|^2."""
+Level = Literal["none", "own", "shared", "both"]
 Prior = Literal["sum", "post-hoc", "gains", "sky-model", "none"]
 
 
@@ -28,23 +30,15 @@ class FitStructure:
 
     Solvers compile once per structure: instances with the same content are equal, and have the same hash.
 
-    Attributes
-    ----------
-    antennas : antenna indices (a, b) of each baseline, shape (Nbls, 2), each in 0 ... n_antennas - 1.
-    groups
-        Index of each baseline's foreground model, shape (Nbls,): ``arange(Nbls)`` for per-baseline modelling
-        (paper Eq. LOGLIKELIHOOD), the redundant group otherwise (Eq. LOGLIKELIHOODREDUNDANT).
-    conjugated : true where a baseline has the conjugate of its model because of its opposite direction, shape (Nbls,)
-    gain_vectors
-        Orthonormal real functions of frequency whose span contains the gains, shape (Nfreqs, Ngain), float64; None for
-        gains without restriction.
-    models_at_once
-        Number of foreground models that are processed at a time; fewer need less memory, and change results by
-        rounding only.
-    prior
-        Coefficients with a finite prior: ``own``, ``shared`` (those of a model that baselines have in common), or
-        ``both``, where every baseline has its own coefficients besides the shared ones; ``none`` if they are free.
-        With a prior, the vectors of the basis are a root of the prior's covariance for a variance of one per channel.
+    Antennas are indices (a, b), (Nbls, 2), each in 0 ... n_antennas - 1. `groups` are the indices of the baselines'
+    foreground models, (Nbls,): ``arange(Nbls)`` for per-baseline modelling (paper Eq. LOGLIKELIHOOD), the redundant
+    groups otherwise (Eq. LOGLIKELIHOODREDUNDANT). Baselines that are `conjugated`, bool, (Nbls,), have the opposite
+    direction, and the conjugate of their model. `gain_vectors` are orthonormal real functions of frequency whose span
+    contains the gains, (Nfreqs, Ngain), float64; None for gains without restriction.
+
+    `prior` says which coefficients have a finite one: ``own``, ``shared`` (those of a model that baselines have in
+    common), or ``both``, where every baseline has its own coefficients besides the shared ones; ``none`` if they are
+    free. With a prior, the vectors of the basis are a root of its covariance for a variance of one per channel.
     """
 
     antennas: np.ndarray
@@ -54,28 +48,14 @@ class FitStructure:
     conjugated: np.ndarray
     gain_vectors: np.ndarray | None = None
     models_at_once: int = MODELS_AT_ONCE
-    prior: Literal["none", "own", "shared", "both"] = "none"
-
-    def __post_init__(self) -> None:
-        n_baselines = len(self.antennas)
-        if self.antennas.shape != (n_baselines, 2) or n_baselines == 0:
-            raise ValueError(f"antennas: shape {self.antennas.shape}, expected (Nbls, 2) with at least one baseline")
-        if self.antennas.min() < 0 or self.antennas.max() >= self.n_antennas:
-            raise ValueError(f"antennas: indices must lie in 0 ... {self.n_antennas - 1}")
-        if self.groups.shape != (n_baselines,) or self.conjugated.shape != (n_baselines,):
-            raise ValueError(f"groups and conjugated: one entry for each of the {n_baselines} baselines is needed")
-        if not np.array_equal(np.unique(self.groups), np.arange(self.basis.n_models)):
-            raise ValueError(f"groups: every one of the {self.basis.n_models} foreground models needs a baseline")
+    prior: Level = "none"
 
     @cached_property
     def _content(self) -> str:
         digest = hashlib.sha256(f"{self.models_at_once} {self.prior}".encode())
-        arrays = [self.antennas, self.groups, self.conjugated.astype(np.int64)]
-        if self.gain_vectors is not None:
-            arrays.append(self.gain_vectors)
-        for bucket in self.basis.buckets:
-            arrays += [bucket.members, bucket.vectors]
-        for array in arrays:
+        arrays = [self.antennas, self.groups, self.conjugated.astype(np.int64), self.gain_vectors]
+        arrays += [array for bucket in self.basis.buckets for array in (bucket.members, bucket.vectors)]
+        for array in (array for array in arrays if array is not None):
             digest.update(repr((array.shape, self.n_antennas)).encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
@@ -109,34 +89,27 @@ class FitStructure:
 class CalibrationProblem:
     """Data and weights of one integration and polarization.
 
-    Raises ValueError for wrong shapes, weights that are negative or not finite, data that are not finite where the
-    weight is not zero, data that are zero everywhere, or initial gains that are zero or not finite.
+    Raises ValueError for weights that are negative or not finite, data that are not finite where the weight is not
+    zero, data that are zero everywhere, or initial gains that are zero or not finite.
 
     Attributes
     ----------
-    visibilities
-        Measured visibilities, shape (Nbls, Nfreqs), complex128, in the unit of the data (Jy). Values with zero weight,
-        NaN included, are set to zero.
-    weights
-        Weights w of the likelihood, shape (Nbls, Nfreqs), float64, none negative; zero where flagged. The paper's are
-        ``1 / (Nbls * Nfreqs)`` (see `flag_weights`).
-    initial_gains : start of the solver, and reference for the phase of the solution, shape (Nants, Nfreqs), complex128
+    visibilities : (Nbls, Nfreqs), in the unit of the data (Jy). Values with zero weight, NaN included, are set to zero.
+    weights : w of the likelihood, (Nbls, Nfreqs), float64; zero where flagged. For the paper's see `flag_weights`.
+    initial_gains : start of the solver, and reference for the phase of the solution, (Nants, Nfreqs)
     sky_model
-        Visibilities m whose weighted sum fixes the overall scale, shape (Nbls, Nfreqs); None for the measured
-        visibilities divided by the initial gains.
+        Visibilities m whose weighted sum fixes the overall scale, (Nbls, Nfreqs); None for the measured ones divided by
+        the initial gains.
     prior
         How the overall scale is fixed: in the loss and after it (``sum``), only after (``post-hoc``, by the sums of the
         models, ``gains``, by the size of the gains, or ``sky-model``, by regression of the calibrated data on the sky
         model), or not.
-    frozen
-        Whether the foregrounds are the sky model, so that only gains are fitted. The scale is then known, and `prior`
-        not used.
+    frozen : whether the foregrounds are the sky model. The scale is then known, and `prior` not used.
     deviations
         Standard deviation per channel of the foregrounds about the sky model, in the unit of the data: of each baseline
-        by itself, and common to those that share a model. The structure's prior selects which apply. The weights must
-        then be inverse variances.
-    scale_weights
-        Weights of the sums that fix the overall scale, like `weights`; None for those. They do not follow the gains.
+        by itself, and common to those that share a model. Those of the structure's prior apply; weights must then be
+        inverse variances.
+    scale_weights : of the sums that fix the overall scale, which do not follow the gains; None for `weights`
     """
 
     structure: FitStructure
@@ -150,9 +123,6 @@ class CalibrationProblem:
     scale_weights: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        self._check_shapes()
-        if self.prior not in get_args(Prior):
-            raise ValueError(f"prior: {self.prior!r} is not one of {', '.join(get_args(Prior))}")
         if self.frozen and self.sky_model is None:
             raise ValueError("sky_model: is needed where the foregrounds are frozen")
         if self.structure.prior != "none" and (self.sky_model is None or not self._deviations_are_finite()):
@@ -170,16 +140,6 @@ class CalibrationProblem:
     def _deviations_are_finite(self) -> bool:
         needed = {"own": self.deviations[:1], "shared": self.deviations[1:], "both": self.deviations}
         return all(0 < value < math.inf for value in needed.get(self.structure.prior, ()))
-
-    def _check_shapes(self) -> None:
-        shape = (self.structure.n_baselines, self.structure.n_frequencies)
-        gain_shape = (self.structure.n_antennas, self.structure.n_frequencies)
-        expected = {"visibilities": shape, "weights": shape, "initial_gains": gain_shape}
-        if self.sky_model is not None:
-            expected["sky_model"] = shape
-        for name, wanted in expected.items():
-            if getattr(self, name).shape != wanted:
-                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {wanted}")
 
     def _blank(self, name: str) -> None:
         """Set a cube to zero where its weight is zero, as complex128, and require finite values elsewhere."""
@@ -315,7 +275,9 @@ def make_structure(frame: Frame, settings: GainFit, band: slice = WHOLE_BAND) ->
         # A finite prior is the same in a part of the band.
         structure = _foregrounds(frame, settings, WHOLE_BAND if settings.foreground_prior.finite else band)
     else:
-        basis = _no_basis(frame.n_baselines, frame.n_channels)
+        # A placeholder, a constant: frozen foregrounds have no coefficients to fit.
+        bucket = Bucket(0.0, np.arange(frame.n_baselines), np.full((frame.n_channels, 1), frame.n_channels**-0.5))
+        basis = ForegroundBasis((bucket,), frame.n_baselines, frame.n_channels)
         structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
     if settings.gain_delay is not None:
         vectors = gain_vectors(frame.frequencies, settings.gain_delay, band)
@@ -325,24 +287,17 @@ def make_structure(frame: Frame, settings: GainFit, band: slice = WHOLE_BAND) ->
 
 def _foregrounds(frame: Frame, settings: ForegroundFit, band: slice) -> FitStructure:
     prior = settings.foreground_prior
-    if prior.shared_deviation == 0:
-        basis = make_basis(frame.lengths, frame.frequencies, settings.basis, prior.finite, band)
-        structure = FitStructure.per_baseline(frame.antennas, frame.n_antennas, basis)
-        return replace(structure, prior="own") if prior.finite else structure
-    groups = redundant_groups(frame.vectors, settings.redundancy_tolerance)
+    tied = prior.shared_deviation != 0
+    kind: Level = "none"
+    if prior.finite:
+        kind = "own" if not tied else "shared" if prior.deviation == 0 else "both"
+    groups = RedundantGroups(np.arange(frame.n_baselines), np.zeros(frame.n_baselines, bool))
+    if tied:
+        groups = redundant_groups(frame.vectors, settings.redundancy_tolerance)
     longest = np.zeros(groups.index.max() + 1)
     np.maximum.at(longest, groups.index, frame.lengths)
     basis = make_basis(longest, frame.frequencies, settings.basis, prior.finite, band)
-    structure = FitStructure(frame.antennas, frame.n_antennas, basis, groups.index, groups.conjugated)
-    if not prior.finite:
-        return structure
-    return replace(structure, prior="shared" if prior.deviation == 0 else "both")
-
-
-def _no_basis(n_models: int, n_frequencies: int) -> ForegroundBasis:
-    """Return a placeholder basis, a constant, for frozen foregrounds, which have no coefficients to fit."""
-    constant = np.full((n_frequencies, 1), n_frequencies**-0.5)
-    return ForegroundBasis((Bucket(0.0, np.arange(n_models), constant),), n_models, n_frequencies)
+    return FitStructure(frame.antennas, frame.n_antennas, basis, groups.index, groups.conjugated, prior=kind)
 
 
 def repeat_structure(structure: FitStructure, count: int) -> FitStructure:

@@ -60,6 +60,18 @@ def make_weights(
     return scaled
 
 
+def require_finite(data: Observation) -> None:
+    """Raise InputError unless all unflagged visibilities are finite."""
+    bad = ~(np.isfinite(data.visibilities) | data.flags)
+    if bad.any():
+        t, baseline, channel, _ = np.argwhere(bad)[0]
+        a, b = data.pairs[baseline]
+        raise InputError(
+            f"{bad.sum()} unflagged visibilities are not finite, the first on baseline ({a}, {b}), integration {t}, "
+            f"channel {channel}; flag them"
+        )
+
+
 def _counts(data: Observation, fitted: np.ndarray, used: np.ndarray, kind: str) -> np.ndarray:
     """Return the numbers of measurements of samples, zero where they are not used."""
     counts = np.where(used, data.nsamples[:, fitted], 0)
@@ -101,10 +113,8 @@ def _from_autos(data: Observation, fitted: np.ndarray) -> np.ndarray:
     antennas, autos = data.antennas[fitted], np.flatnonzero(data.autos)
     missing = data.numbers[np.setdiff1d(antennas, data.antennas[autos])]
     if missing.size:
-        raise InputError(
-            "weights: 'autos' needs autocorrelations, which the data lack for antenna(s) "
-            f"{', '.join(map(str, missing))}"
-        )
+        lacking = ", ".join(map(str, missing))
+        raise InputError(f"weights: 'autos' needs autocorrelations, which the data lack for antenna(s) {lacking}")
     power = np.where(data.flags, 0, np.nan_to_num(data.visibilities.real))
     inverse = np.where(power > 0, 1 / np.where(power > 0, power, 1), 0)
     first, second = autos[positions(data.antennas[autos, 0], antennas)].T
@@ -163,12 +173,9 @@ def dead_samples(data: Observation, chosen: np.ndarray) -> np.ndarray:
     zero = ~data.flags[:, chosen] & (data.visibilities[:, chosen] == 0)
     if not zero.any():
         return zero
-    alive = ~data.flags[:, chosen] & ~zero
-    antennas = data.antennas[chosen]
-    has_data = np.zeros((len(data.numbers), *np.delete(zero.shape, 1)), bool)
-    for column in antennas.T:
-        np.logical_or.at(has_data, column, np.moveaxis(alive, 1, 0))
-    first, second = (np.moveaxis(has_data[column], 0, 1) for column in antennas.T)
+    alive = ~data.flags & (data.visibilities != 0) & chosen[:, None, None]
+    has_data = data.antennas_of(np.moveaxis(alive, 1, 0))
+    first, second = (np.moveaxis(has_data[column], 0, 1) for column in data.antennas[chosen].T)
     return zero & ~(first & second)
 
 
@@ -198,16 +205,12 @@ def conspicuous(data: Observation) -> list[str]:
             f"Antenna {data.numbers[antenna]}: amplitudes of its visibilities are {own[antenna] / median:.2g} times "
             "the median of the antennas; flag it if it is broken, for it can decide the gains of all others."
         )
-    return found + _few_channels(live)
-
-
-def _few_channels(live: np.ndarray) -> list[str]:
-    """Describe solves with data in few channels; `live` is (Ntimes, Nbls, Nfreqs, Npols)."""
-    counts = live.any(axis=1).sum(axis=1)
-    few = (counts > 0) & (counts < FEW * live.shape[2])
-    if not few.any():
-        return []
-    return [
-        f"{few.any(axis=1).sum()} integration(s) have data in at most {counts[few].max()} of {live.shape[2]} channels: "
-        "gains that are fitted together with foregrounds mean nothing there."
-    ]
+    channels = live.any(axis=1).sum(axis=1)
+    few = (channels > 0) & (channels < FEW * data.n_channels)
+    if few.any():
+        most = f"{channels[few].max()} of {data.n_channels}"
+        found.append(
+            f"{few.any(axis=1).sum()} integration(s) have data in at most {most} channels: gains that are fitted "
+            "together with foregrounds mean nothing there."
+        )
+    return found

@@ -77,6 +77,7 @@ def test_room_is_found_where_a_basis_can_be_made(used):
     answers = []
     for length in np.linspace(0, 400, 41):
         made = refused(lambda length: make_basis(np.array([length]), FREQUENCIES[used], BASIS), length)
-        assert refused(lambda length: require_room(length, FREQUENCIES[used], BASIS), length) == made
+        planned = refused(lambda length: require_room(length, FREQUENCIES[used], BASIS), length)
+        assert planned == (made and f"{made} (the longest baseline has {length:.0f} m)")
         answers.append(made)
     assert answers[0] == "" != answers[-1]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -97,7 +97,7 @@ class Ddecal(OtherPackage):
         """Run DDECal on the measurement set of a folder."""
         program = _program()
         assert program is not None, "refused before"
-        settings: dict[str, object] = {
+        settings = {
             "msin": folder / "data.ms",
             "msout": "",
             "steps": "[cal]",
@@ -117,14 +117,13 @@ class Ddecal(OtherPackage):
         if self.smoothness is not None:
             settings["cal.smoothnessconstraint"] = self.smoothness
         threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        environment: Mapping[str, str] = {**os.environ, **threads, "CASARCFILES": str(folder / "casarc")}
         return subprocess.run(
             [program, *(f"{name}={value}" for name, value in settings.items())],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             check=False,
-            env=environment,
+            env={**os.environ, **threads, "CASARCFILES": str(folder / "casarc")},
             cwd=folder,
         )
 
@@ -133,25 +132,18 @@ class Ddecal(OtherPackage):
         found = re.search(r"Iterations taken: \[([\d,]+)\]", output)
         if found is None:
             raise RuntimeError(f"DP3 does not say how many iterations it took:\n{output}")
-        outcomes = []
-        for steps in [int(text) for text in found[1].split(",")][:n_groups]:
-            if steps > self.max_steps:
-                message = f"not converged after {self.max_steps} steps"
-                outcomes.append(Solve(status="max-steps", message=message, steps=self.max_steps))
-            else:
-                message = f"gains changed by less than {self.tolerance:g}"
-                outcomes.append(Solve(status="converged", message=message, steps=steps))
-        return outcomes
+        return [
+            Solve("converged", f"gains changed by less than {self.tolerance:g}", steps=steps)
+            if steps <= self.max_steps
+            else Solve("max-steps", f"not converged after {self.max_steps} steps", steps=self.max_steps)
+            for steps in [int(text) for text in found[1].split(",")][:n_groups]
+        ]
 
 
 def _program() -> str | None:
     """Find DP3 on the path, or next to the running Python."""
-    beside = str(Path(sys.executable).parent)
-    for name in COMMANDS:
-        for path in (None, beside):
-            if (command := shutil.which(name, path=path)) is not None:
-                return command
-    return None
+    places = itertools.product(COMMANDS, (None, str(Path(sys.executable).parent)))
+    return next(filter(None, (shutil.which(name, path=path) for name, path in places)), None)
 
 
 def _write_measurement_set(folder: Path, measured: Measured, groups: list[slice]) -> None:

@@ -9,9 +9,9 @@ and are identified by the sky model.
 from __future__ import annotations
 
 import hmac
-from dataclasses import dataclass
+import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
@@ -20,12 +20,12 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import FileName, require_inside
 from calstudy.base.gain_files import GainTable, read_gain_file, read_gains
-from calstudy.base.gains import require_solutions, solutions
+from calstudy.base.gains import closest_solutions, require_solutions, solution_times, solutions
 from calstudy.base.observation import Frame, Observation
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import FOLDER, UNKEYED, Section, fault
 from calstudy.base.visibilities import to_cube
-from calstudy.calibrate.interface import Assumed, Calibration, Calibrator, Progress, Solve
+from calstudy.calibrate.interface import NO_SKY_MODEL, Assumed, Calibration, Calibrator, Progress, Solve
 from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.instrument.settings import Size
 
@@ -50,7 +50,7 @@ class NoCalibration(Calibrator):
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return a sentence if there is no sky model to subtract."""
-        return None if has_sky_model else "needs a sky model, and there is none"
+        return None if has_sky_model else NO_SKY_MODEL
 
     def cost(self, size: Size) -> Cost:
         """Return the cost of the subtraction."""
@@ -63,12 +63,11 @@ class NoCalibration(Calibrator):
         count = n_polarizations * len(self.solves(n_times))
         if progress is not None:
             progress(count, count)
-        found = Solve(status="converged", message="gains of one: nothing is fitted")
-        nothing = Solve(status="skipped", message="every sample is flagged")
-        empty = [
-            observation.flags[times, ..., p].all() for p in range(n_polarizations) for times in self.solves(n_times)
-        ]
-        return Calibration(gains=gains, outcomes=[nothing if flagged else found for flagged in empty])
+        found = Solve("converged", "gains of one: nothing is fitted")
+        nothing = Solve("skipped", "every sample is flagged")
+        solves = itertools.product(range(n_polarizations), self.solves(n_times))
+        outcomes = [nothing if observation.flags[times, ..., p].all() else found for p, times in solves]
+        return Calibration(gains=gains, outcomes=outcomes)
 
 
 class ByFile(Calibrator):
@@ -140,7 +139,7 @@ class ByFile(Calibrator):
         count = len(self.solves(observation.n_times)) * observation.n_polarizations
         if progress is not None:
             progress(count, count)
-        outcome = Solve(status="by-file", message=f"gains of {self.gains.name}")
+        outcome = Solve("by-file", f"gains of {self.gains.name}")
         model = None if self.model is None else to_cube(read_sky_model(self.model, observation.uvd))
         return Calibration(gains=gains, gain_flags=flags, model=model, outcomes=[outcome] * count)
 
@@ -170,12 +169,10 @@ def _places(path: Path, cal: UVCal, observation: Observation) -> np.ndarray:
     if cal.Ntimes == 1:
         return np.zeros(observation.n_times, int)
     half = np.full(cal.Ntimes, float(np.min(observation.uvd.integration_time)) / 2 / SECONDS_PER_DAY)
-    times = cal.time_array
-    if times is None:
-        times, half = cal.time_range.mean(axis=1), np.maximum(np.diff(cal.time_range, axis=1)[:, 0] / 2, half)
-    away = np.abs(times[None] - observation.times[:, None])
-    places = away.argmin(axis=1)
-    lacking = np.flatnonzero(away[np.arange(len(places)), places] > half[places])
+    if cal.time_array is None:
+        half = np.maximum(np.diff(cal.time_range, axis=1)[:, 0] / 2, half)
+    places = closest_solutions(cal, observation.times)
+    lacking = np.flatnonzero(np.abs(solution_times(cal)[places] - observation.times) > half[places])
     if lacking.size:
         raise InputError(
             f"{path}: has no solution within half an integration of JD {observation.times[lacking[0]]:.6f} "
@@ -196,13 +193,9 @@ class DataSet(Section):
 class Manifest(Section):
     """The content of a folder of exported data, without any information on the experiment.
 
-    Attributes
-    ----------
-    calstudy : version of calstudy that wrote it
-    digest : digest of all data sets and the sky model; it links the folder to the experiment
-    sky_model : file of the assumed visibilities of the foregrounds; None if nothing is assumed
-    sky_model_digest : digest of all inputs of the sky model
-    noise : standard deviation of the complex noise of a sample, Jy; None if the data have none
+    `calstudy` is the version that wrote it. `digest` is that of all data sets and the sky model, and links the folder
+    to the experiment. `sky_model` is the file of the assumed foregrounds, None if nothing is assumed, and `noise` the
+    standard deviation of the complex noise of a sample, Jy, None if the data have none.
     """
 
     calstudy: str
@@ -218,8 +211,7 @@ def salted(digest: str, salt: str) -> str:
     return hmac.new(salt.encode(), digest.encode(), "sha256").hexdigest()[:32] if salt else digest
 
 
-@dataclass(frozen=True)
-class Returned:
+class Returned(NamedTuple):
     """The files of the gains and, if there is one, of the model that were returned for one data set."""
 
     gains: Path

@@ -10,7 +10,7 @@ from calstudy.base.quiet import require_tensorflow
 from calstudy.base.resources import Cost
 from calstudy.calibrate.basis import require_room
 from calstudy.calibrate.cost import LEAST_MODELS, Dimensions, solve_cost, solve_memory
-from calstudy.calibrate.interface import Assumed, Calibration, Progress, SolvePlan
+from calstudy.calibrate.interface import NO_SKY_MODEL, Assumed, Calibration, Progress, SolvePlan
 from calstudy.calibrate.problem import fitted_baselines, make_structure, repeat_structure
 from calstudy.calibrate.settings import ForegroundFit, ForegroundPrior, GainFit, GaussNewtonSettings, ScalePrior, Solver
 from calstudy.instrument.settings import Size
@@ -50,7 +50,7 @@ class _LeastSquares(GainFit):
             require_tensorflow()
             frame = self.fitted(frame.baselines(fitted_baselines(frame, self.autos)))
             if isinstance(self, ForegroundFit) and not self.frozen:
-                _require_basis(frame, self)
+                require_room(frame.lengths.max(), frame.frequencies, self.basis)
         except InputError as error:
             return str(error).removeprefix("calibration.")
         return None
@@ -67,12 +67,11 @@ class _LeastSquares(GainFit):
         coefficients = structure.basis.n_coefficients
         unknowns = coefficients + structure.n_antennas * structure.n_frequencies
         samples = structure.n_baselines * structure.n_frequencies
-        notes: tuple[str, ...] = ()
-        if unknowns >= CROWDED * samples:
-            notes = (
-                f"The fit has {unknowns} unknowns for {samples} samples, so that it can absorb anything: expect slow "
-                "convergence, and no residual; use a smaller basis.min_delay or --buffer, or --redundant.",
-            )
+        note = (
+            f"The fit has {unknowns} unknowns for {samples} samples, so that it can absorb anything: expect slow "
+            "convergence, and no residual; use a smaller basis.min_delay or --buffer, or --redundant."
+        )
+        notes = (note,) if unknowns >= CROWDED * samples else ()
         return SolvePlan(cost, f"{coefficients} foreground coefficients each", notes)
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
@@ -80,15 +79,6 @@ class _LeastSquares(GainFit):
         from calstudy.calibrate.calamity import fit
 
         return fit(observation, assumed, self, progress)
-
-
-def _require_basis(frame: Frame, settings: ForegroundFit) -> None:
-    """Raise InputError if the channels cannot hold the foreground basis of the longest baseline."""
-    longest = frame.lengths.max()
-    try:
-        require_room(longest, frame.frequencies, settings.basis)
-    except InputError as error:
-        raise InputError(f"{error} (the longest baseline has {longest:.0f} m)") from None
 
 
 class Calamity(_LeastSquares, ForegroundFit):
@@ -120,10 +110,18 @@ class SkyBased(_LeastSquares):
 
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return a sentence if there is no sky model, or nothing to fit."""
-        return super().refusal(frame, True) if has_sky_model else "needs a sky model, and there is none"
+        return super().refusal(frame, True) if has_sky_model else NO_SKY_MODEL
 
 
-class DelayWeighted(_LeastSquares, ForegroundFit):
+class _AboutSkyModel(_LeastSquares, ForegroundFit):
+    """A fit of gains and of foregrounds that deviate from a sky model."""
+
+    prior: ScalePrior = "sky-model"
+    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
+    solver: Solver = GaussNewtonSettings(tolerance=1e-5)
+
+
+class DelayWeighted(_AboutSkyModel):
     """Gains are fitted with a sky model whose errors, of known size, fill the modelled delays of each baseline."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
@@ -136,12 +134,9 @@ class DelayWeighted(_LeastSquares, ForegroundFit):
     version: ClassVar[int] = 8
     calibrator: str = "delay-weighted"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.1)
-    prior: ScalePrior = "sky-model"
-    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
-    solver: Solver = GaussNewtonSettings(tolerance=1e-5)
 
 
-class Unified(_LeastSquares, ForegroundFit):
+class Unified(_AboutSkyModel):
     """Gains are fitted with a sky model whose errors are common to redundant baselines, but for a smaller part."""
 
     # Fits with a finite prior converge since 2; before, they stopped at or ahead of the largest number of steps.
@@ -154,12 +149,9 @@ class Unified(_LeastSquares, ForegroundFit):
     version: ClassVar[int] = 8
     calibrator: str = "unified"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation=0.05, shared_deviation=0.1)
-    prior: ScalePrior = "sky-model"
-    # At the default tolerance the foreground residual exceeds the EoR near the wedge.
-    solver: Solver = GaussNewtonSettings(tolerance=1e-5)
 
 
-class EmpiricalBayes(_LeastSquares, ForegroundFit):
+class EmpiricalBayes(_AboutSkyModel):
     """Gains are fitted with a sky model whose errors fill the modelled delays; the data tell their size."""
 
     # Only the last solve has the full tolerance since 2.
@@ -172,6 +164,3 @@ class EmpiricalBayes(_LeastSquares, ForegroundFit):
     version: ClassVar[int] = 8
     calibrator: str = "empirical-bayes"
     foreground_prior: ForegroundPrior = ForegroundPrior(mean="sky-model", deviation="estimated")
-    prior: ScalePrior = "sky-model"
-    # As for a given deviation.
-    solver: Solver = GaussNewtonSettings(tolerance=1e-5)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
@@ -12,17 +11,16 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
+from calstudy.base.quiet import without_warnings
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost, Usage
 from calstudy.calibrate.boards import Boards
-from calstudy.calibrate.degeneracy import fix_phase
-from calstudy.calibrate.interface import Assumed, Calibration, Progress, Solve
-from calstudy.calibrate.problem import gain_products, gain_weights, weight_change
+from calstudy.calibrate.degeneracy import FEED, POL, fix_phase
+from calstudy.calibrate.interface import NO_SKY_MODEL, Assumed, Calibration, Progress, Solve
+from calstudy.calibrate.problem import NOTHING_WEIGHTED, fitted_baselines, gain_products, gain_weights, weight_change
 from calstudy.calibrate.records import require_parallel_hands
 from calstudy.calibrate.settings import RUNAWAY, GainWeights, WeightedFit, unsettled_message
 from calstudy.instrument.settings import Size
 
-# hera_cal wants a name for the polarization; each is calibrated by itself.
-POL, FEED = "nn", "Jnn"
 SLOW = 0.5
 """Passes whose weights change by more than this part of the change before go half of the way."""
 
@@ -55,15 +53,11 @@ class Measured:
             weights[times] = gain_weights(*rows).reshape(part.shape)
         return replace(self, weights=weights)
 
-    def keys(self, rows: np.ndarray) -> list[tuple[int, int, str]]:
-        """Return the keys of some baselines in hera_cal."""
-        return [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
-
     def containers(self, rows: np.ndarray, *parts: np.ndarray) -> list[Any]:
         """Return parts of some baselines, (len(rows), Nfreqs), as hera_cal has them: of a single time."""
         from hera_cal.datacontainer import DataContainer
 
-        keys = self.keys(rows)
+        keys = [(int(a), int(b), POL) for a, b in self.frame.antennas[rows]]
         return [DataContainer({key: row[None] for key, row in zip(keys, part, strict=True)}) for part in parts]
 
 
@@ -80,11 +74,9 @@ class OtherPackage(WeightedFit):
     def refusal(self, frame: Frame, has_sky_model: bool) -> str | None:
         """Return a sentence if there is no sky model, or nothing to calibrate."""
         if not has_sky_model:
-            return "needs a sky model, and there is none"
-        if frame.autos.all():
-            return "the data hold no cross-correlations, so that there is nothing to calibrate"
+            return NO_SKY_MODEL
         try:
-            self.fitted(frame.baselines(~frame.autos))
+            self.fitted(frame.baselines(fitted_baselines(frame, autos=False)))
         except InputError as error:
             return str(error)
         return None
@@ -100,17 +92,15 @@ class OtherPackage(WeightedFit):
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Solve every polarization, and flag the gains of antennas and channels without data."""
-        from calstudy.calibrate.weights import make_weights
+        from calstudy.calibrate.weights import make_weights, require_finite
 
-        if assumed.sky_model is None:
-            raise InputError(f"{self.label}: needs a sky model, and there is none")
+        assert assumed.sky_model is not None, "refused before"
         require_parallel_hands(observation.uvd)
         crosses = ~observation.autos
         groups = self.solves(observation.n_times)
         weights = make_weights(observation, crosses, self.weights, groups)
         data, sky = observation.baselines(crosses), assumed.sky_model.baselines(crosses)
-        if not (np.isfinite(data.visibilities) | data.flags).all():
-            raise InputError(f"{self.label}: unflagged visibilities are not finite; flag them")
+        require_finite(data)
         factors = 1.0 if self.baselines is None else self.baselines.factors(data.lengths, data.antennas)[:, None]
         gains = np.full((data.n_antennas, data.n_channels, len(groups), data.n_polarizations), np.nan, complex)
         outcomes: list[Solve] = []
@@ -124,9 +114,11 @@ class OtherPackage(WeightedFit):
             if progress is not None:
                 progress((p + 1) * len(groups), data.n_polarizations * len(groups))
         unknown = ~np.isfinite(gains) | (gains == 0)
-        gains = _turned(np.where(unknown, 0, gains))
+        flat = np.where(unknown, 0, gains).reshape(len(gains), -1)
+        # Their sum over antennas is real and positive in every channel.
+        turned = fix_phase(flat, np.ones_like(flat)).reshape(gains.shape)
         return Calibration(
-            gains=np.where(unknown, 1, gains),
+            gains=np.where(unknown, 1, turned),
             gain_flags=unknown,
             flags=weights == 0,
             baselines=crosses,
@@ -136,22 +128,14 @@ class OtherPackage(WeightedFit):
     def _solve_timed(self, measured: Measured, groups: list[slice]) -> tuple[np.ndarray, list[Solve]]:
         """Solve the groups that have data, and skip the others."""
         full = [number for number, times in enumerate(groups) if measured.weights[times].any()]
-        shape = (measured.frame.n_antennas, measured.frame.n_channels, len(groups))
-        gains = np.full(shape, np.nan, complex)
-        message = "every sample is flagged or has no weight"
-        ended = [Solve(status="skipped", message=message, seconds=0.0, cpu_seconds=0.0)] * len(groups)
+        gains = np.full((measured.frame.n_antennas, measured.frame.n_channels, len(groups)), np.nan, complex)
+        ended = [Solve("skipped", NOTHING_WEIGHTED, seconds=0.0, cpu_seconds=0.0)] * len(groups)
         if full:
-            with Usage() as usage, warnings.catch_warnings(), np.errstate(all="ignore"):
-                # These packages divide by zeros, and warn of numbers that they replace themselves.
-                warnings.simplefilter("ignore")
+            with Usage() as usage, without_warnings():
                 gains[:, :, full], found = self._solve_in_passes(measured, [groups[number] for number in full])
+            share, cpu_share = usage.seconds / len(full), usage.cpu_seconds / len(full)
             for number, outcome in zip(full, found, strict=True):
-                ended[number] = replace(
-                    outcome,
-                    seconds=usage.seconds / len(full),
-                    cpu_seconds=usage.cpu_seconds / len(full),
-                    peak_memory=usage.peak_memory,
-                )
+                ended[number] = replace(outcome, seconds=share, cpu_seconds=cpu_share, peak_memory=usage.peak_memory)
         return gains, ended
 
     def _solve_in_passes(self, measured: Measured, groups: list[slice]) -> Solved:
@@ -201,17 +185,9 @@ def _halfway(used: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 def _in_passes(outcome: Solve, change: float, unsettled: bool, passes: int) -> Solve:
     """Return an outcome with the number of passes and the last change of the weights."""
-    diagnostics = {**outcome.diagnostics, "passes": passes, "weight_change": change}
-    if not unsettled or outcome.status != "converged":
-        return replace(outcome, diagnostics=diagnostics)
-    message = unsettled_message(change, passes)
-    return replace(outcome, status="max-steps", message=message, diagnostics=diagnostics)
-
-
-def _turned(gains: np.ndarray) -> np.ndarray:
-    """Rotate gains so that their sum over antennas is real and positive in every channel; unknown ones are zero."""
-    flat = gains.reshape(len(gains), -1)
-    return fix_phase(flat, np.ones_like(flat)).reshape(gains.shape)
+    if unsettled and outcome.status == "converged":
+        outcome = replace(outcome, status="max-steps", message=unsettled_message(change, passes))
+    return replace(outcome, diagnostics={**outcome.diagnostics, "passes": passes, "weight_change": change})
 
 
 def patterns(used: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -220,10 +196,8 @@ def patterns(used: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     `used` is bool, (Nbls, Ncells), where a cell is a channel, or a channel of an integration.
     """
     packed = np.ascontiguousarray(np.packbits(used, axis=0).T)
-    sets, number = np.unique(packed, axis=0, return_inverse=True)
-    number = number.ravel()
-    first = [int(np.flatnonzero(number == index)[0]) for index in range(len(sets))]
-    return [(used[:, cell], np.flatnonzero(number == index)) for index, cell in enumerate(first)]
+    _, first, number = np.unique(packed, axis=0, return_index=True, return_inverse=True)
+    return [(used[:, cell], np.flatnonzero(number.ravel() == index)) for index, cell in enumerate(first)]
 
 
 class Skycal(OtherPackage):
@@ -330,10 +304,8 @@ class Skycal(OtherPackage):
         solved, failed = steps > 0, steps < 0
         longest = int(steps.max(initial=0))
         if not solved.any():
-            return Solve(status="failed", message=f"gains converged in no channel within {self.max_steps} steps")
+            return Solve("failed", f"gains converged in no channel within {self.max_steps} steps")
         if failed.any():
-            message = (
-                f"gains did not converge in {failed.sum()} of {(solved | failed).sum()} channels, which are flagged"
-            )
-            return Solve(status="stalled", message=message, steps=longest)
-        return Solve(status="converged", message=f"gains changed by less than {self.tolerance:g}", steps=longest)
+            counts = f"{failed.sum()} of {(solved | failed).sum()}"
+            return Solve("stalled", f"gains did not converge in {counts} channels, which are flagged", steps=longest)
+        return Solve("converged", f"gains changed by less than {self.tolerance:g}", steps=longest)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -12,8 +13,8 @@ from calstudy.base.observation import Frame
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import fault
 from calstudy.base.units import Length
-from calstudy.calibrate.calibrators.other_packages import FEED, POL, Measured, OtherPackage, Solved, patterns
-from calstudy.calibrate.degeneracy import fix_phase
+from calstudy.calibrate.calibrators.other_packages import Measured, OtherPackage, Solved, patterns
+from calstudy.calibrate.degeneracy import FEED, POL, fix_phase, gradient_turns
 from calstudy.calibrate.interface import Solve
 from calstudy.calibrate.problem import gain_products
 from calstudy.calibrate.settings import FlagWeights, GainWeights
@@ -129,28 +130,24 @@ class Redcal(OtherPackage):
 
     def _outcome(self, status: np.ndarray, steps: np.ndarray) -> Solve:
         """Return how a solve ended, from the status of its channels in `_Redundant.solve`."""
-        marks, longest = set(status.ravel()), int(steps.max())
-        count = {mark: int(np.sum(status == mark)) for mark in ("max-steps", "stalled", "failed")}
-        if not marks & {"converged", "max-steps", "stalled"}:
+        count, longest = Counter(status.ravel().tolist()), int(steps.max())
+        if not count.keys() & {"converged", "max-steps", "stalled"}:
             message = "redundant baselines that are not flagged do not tie the antennas to each other in any channel"
-            return Solve(status="failed", message=message)
+            return Solve("failed", message)
         if count["max-steps"]:
             message = f"omnical did not converge within {self.max_steps} steps in {count['max-steps']} channels"
-            return Solve(status="max-steps", message=message, steps=longest)
+            return Solve("max-steps", message, steps=longest)
         if count["stalled"] or count["failed"]:
             message = (
                 f"omnical found nothing better in {count['stalled']} channels before it converged, and "
                 f"{count['failed']} without a solution are flagged"
-                + (
-                    "; leave firstcal out of steps if phases of gains are not those of cable delays"
-                    if "firstcal" in self.steps
-                    else ""
-                )
             )
-            return Solve(status="stalled", message=message, steps=longest)
+            if "firstcal" in self.steps:
+                message += "; leave firstcal out of steps if phases of gains are not those of cable delays"
+            return Solve("stalled", message, steps=longest)
         if "omnical" not in self.steps:
-            return Solve(status="converged", message=f"{', '.join(self.steps)}: linear fits, without iteration")
-        return Solve(status="converged", message=f"omnical changed by less than {self.tolerance:g}", steps=longest)
+            return Solve("converged", f"{', '.join(self.steps)}: linear fits, without iteration")
+        return Solve("converged", f"omnical changed by less than {self.tolerance:g}", steps=longest)
 
 
 def _average(gains: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -173,14 +170,9 @@ def _undetermined(antennas: np.ndarray, groups: RedundantGroups) -> str | None:
     `antennas` are those of each baseline, (Nbls, 2). Each group has an unknown visibility, which is eliminated.
     """
     present, places = np.unique(antennas, return_inverse=True)
-    first, second = places.reshape(-1, 2).T
+    first, second = np.eye(present.size)[places.reshape(-1, 2).T]
     open_ = []
-    for sign in (1, -1):
-        rows = np.zeros((len(first), present.size))
-        np.add.at(rows, (np.arange(len(first)), first), 1)
-        np.add.at(rows, (np.arange(len(first)), second), sign)
-        if sign < 0:
-            rows[groups.conjugated] *= -1
+    for rows in (first + second, np.where(groups.conjugated[:, None], second - first, first - second)):
         size = np.bincount(groups.index)
         means = np.stack([np.bincount(groups.index, column) for column in rows.T], axis=1) / size[:, None]
         rest = rows - means[groups.index]
@@ -219,21 +211,19 @@ class _Redundant:
         used = (weights > 0) & self.solvable
         anywhere = used.any(axis=(1, 2))
         shared = np.bincount(index[anywhere], minlength=index.max() + 1)[index] > 1
-        self.rows = np.flatnonzero(anywhere & shared)
-        self.keys = {}
         data, sky, weight = {}, {}, {}
-        for row in self.rows:
+        reds: dict[int, list[tuple[int, int, str]]] = {}
+        for row in np.flatnonzero(anywhere & shared):
             back = groups.conjugated[row]
             a, b = measured.frame.antennas[row][:: -1 if back else 1]
-            key = self.keys[row] = (int(a), int(b), POL)
+            key = (int(a), int(b), POL)
+            reds.setdefault(index[row], []).append(key)
             model = np.where(measured.sky[times, row] == 0, 1, measured.sky[times, row])
             measurement = np.where(used[row], measured.visibilities[times, row], model)
             data[key], sky[key] = (values.conj() if back else values for values in (measurement, model))
             weight[key] = np.where(self.solvable, weights[row], 1.0)
         self.data, self.sky, self.weights = data, sky, weight
-        self.reds = [
-            [self.keys[row] for row in self.rows[index[self.rows] == group]] for group in np.unique(index[self.rows])
-        ]
+        self.reds = [reds[group] for group in sorted(reds)]
 
     def solve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return gains (Nants, Ntimes, Nfreqs), NaN without a solution, and status and steps of each cell.
@@ -322,19 +312,17 @@ class _Redundant:
 
     def _absolute(self, gains: Gains) -> Gains:
         """Fit phase gradient and amplitude of the gains to the sky model in each channel."""
-        from hera_cal.abscal import abs_amp_lincal, complex_phase_abscal
+        from hera_cal.abscal import abs_amp_lincal
         from hera_cal.datacontainer import DataContainer
 
         calibrated = _calibrated(self.data, gains)
         # Of the calibrated data: those of the measured ones times |g_a g_b|^2.
-        weights = {key: weight * _power(gains, key) for key, weight in self.weights.items()}
-        # All that the phase gradient depends on: the sum over each group. It is of group members on one grid point.
-        heads = [group[0] for group in self.reds]
-        overlap = {
-            group[0]: sum(weights[key] * calibrated[key] * self.sky[key].conj() for key in group) for group in self.reds
+        weights = {
+            (a, b, pol): weight * np.abs(gains[a, FEED] * gains[b, FEED]) ** 2
+            for (a, b, pol), weight in self.weights.items()
         }
-        ones = {key: np.ones(self.solvable.shape, complex) for key in heads}
-        _, turns = complex_phase_abscal(DataContainer(overlap), DataContainer(ones), self.reds, heads, heads)
+        overlap = {key: weights[key] * calibrated[key] * self.sky[key].conj() for key in self.data}
+        turns = gradient_turns(self.reds, overlap)
         gains = {key: gain * turns[key] for key, gain in gains.items()}
         data, sky, wgts = (DataContainer(values) for values in (_calibrated(self.data, gains), self.sky, weights))
         scales = abs_amp_lincal(sky, data, wgts=wgts, verbose=False, return_gains=True, gain_ants=list(gains))
@@ -361,11 +349,6 @@ def _calibrator(reds: list[list[tuple[int, int, str]]]) -> RedundantCalibrator:
             return super()._solver(Omnical if solver is OmnicalSolver else solver, *args, **settings)
 
     return Calibrator(reds)
-
-
-def _power(gains: Gains, key: tuple[int, int, str]) -> np.ndarray:
-    """Return |g_a g_b|^2 of a baseline."""
-    return np.abs(gains[key[0], FEED] * gains[key[1], FEED]) ** 2
 
 
 def _calibrated(data: Visibilities, gains: Gains) -> Visibilities:
