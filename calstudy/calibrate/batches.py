@@ -34,10 +34,9 @@ ALIKE = 4
 
 
 class Batch(NamedTuple):
-    """Consecutive models whose foregrounds are eliminated at once.
+    """Consecutive models, from the first to one past the last in the solvers' order, that are eliminated at once.
 
-    Models and baselines are given by the first one and one past the last, in the solvers' order. `bases` are their
-    different bases, (Nfreqs, Nvec) each, float64, and `basis_index` is that of each model, (Nmodels,), ascending.
+    `bases` are the different ones, (Nfreqs, Nvec) each, float64, and `basis_index` that of each model, ascending.
     """
 
     models: tuple[int, int]
@@ -76,12 +75,9 @@ def make_batches(bases: Sequence[np.ndarray], sizes: Sequence[int], edges: np.nd
 class Vectors:
     """Products with the vectors A of some rows, which are models or baselines.
 
-    Parameters
-    ----------
-    bases : different A^T, (Nbases, Nvec, length), float64, padded with rows of zeros
-    overlaps : A^T Q of each, (Nbases, Nvec, rank), with the batch's span Q, in the precision of the inner products
-    widths : numbers of vectors that are not padding, (Nbases,)
-    index : index of the basis of each row, (Nrows,), ascending
+    `bases` are the different A^T, (Nbases, Nvec, length), float64, padded with rows of zeros beyond the numbers of
+    vectors, `widths`; `overlaps` are A^T Q of each, (Nbases, Nvec, rank), with the batch's span Q, in the precision of
+    the inner products; `index` is that of the basis of each row, (Nrows,), ascending.
     """
 
     def __init__(self, bases: np.ndarray, overlaps: np.ndarray, widths: np.ndarray, index: np.ndarray) -> None:
@@ -149,12 +145,9 @@ class Vectors:
 class Piece(NamedTuple):
     """One batch, and the vectors of its models.
 
-    Attributes
-    ----------
-    span
-        Orthonormal basis Q of the span of the batch's vectors, (Nfreqs, rank), in the precision of the inner products.
-    owner : position in the batch of the model of each baseline, (Nbls,); None if each baseline is its own model
-    own : vectors of the baselines, if they have their own coefficients besides the shared ones
+    `span` is an orthonormal basis Q of what they span, (Nfreqs, rank), in the precision of the inner products. `owner`
+    is the position in the batch of the model of each baseline, ascending, (Nbls,); None if each baseline is its own
+    model. `own` are vectors of the baselines, if they have their own coefficients besides the shared ones.
     """
 
     batch: Batch
@@ -185,22 +178,15 @@ class Piece(NamedTuple):
 
 
 def make_piece(batch: Batch, span: np.ndarray, owner: np.ndarray | None, with_own: bool, dtype: tf.DType) -> Piece:
-    """Build the vectors of a batch; those of its baselines as well, if these have their own coefficients.
-
-    `span` is as from `span_of`. `owner` is the position in the batch of the model of each baseline, ascending, (Nbls,),
-    or None if each baseline is its own model. `dtype` is that of the span and the overlaps.
-    """
+    """Build the vectors of a batch; those of its baselines as well, if these have their own coefficients."""
     kind = dtype.as_numpy_dtype
-    own = batch_vectors(batch, span, owner, kind) if with_own else None
+    own = _vectors(batch, span, owner, kind) if with_own else None
     index = None if owner is None else tf.constant(owner, tf.int32)
-    return Piece(batch, tf.constant(span, dtype), index, batch_vectors(batch, span, None, kind), own)
+    return Piece(batch, tf.constant(span, dtype), index, _vectors(batch, span, None, kind), own)
 
 
 def span_of(bases: Sequence[np.ndarray], dtype: tf.DType) -> np.ndarray:
-    """Return an orthonormal basis of the joint span of several bases, (Nfreqs, rank), float64.
-
-    Bases are (Nfreqs, Nvec). `dtype` sets the precision.
-    """
+    """Return an orthonormal basis of the joint span of bases (Nfreqs, Nvec), (Nfreqs, rank), to a precision."""
     vectors = np.concatenate([_normalized(basis) for basis in bases], axis=1)
     # R of a QR decomposition has the same left singular vectors; the right ones, of no use, would take most time.
     triangle = np.asarray(np.linalg.qr(vectors.T, mode="r"))
@@ -214,7 +200,7 @@ def product_span(pairs: Sequence[tuple[np.ndarray, np.ndarray]], dtype: tf.DType
     Smooth columns, such as foreground vectors, have products whose rank is little more than the sum of both ranks. The
     span is found from products of random combinations of the columns (Halko, Martinsson & Tropp 2011, SIAM Rev. 53,
     217). Each column of the first of a pair is multiplied with each of the second, (length, Nleft) and (length,
-    Nright), float64. `dtype` is that of the basis and sets the precision.
+    Nright), float64.
     """
     rng = np.random.default_rng(1)
     samples = []
@@ -242,12 +228,8 @@ def column_products(rows: tf.Tensor, left: tf.Tensor, right: tf.Tensor, span: tf
     return tf.reshape(found, [-1, left.shape[1], right.shape[1]])
 
 
-def batch_vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
-    """Build the vectors of the models of a batch or, with `owner`, of its baselines.
-
-    `span` is Q, (Nfreqs, rank). `owner` is the position in the batch of the model of each baseline, ascending, (Nbls,).
-    `dtype` is that of the overlaps.
-    """
+def _vectors(batch: Batch, span: np.ndarray, owner: np.ndarray | None, dtype: np.dtype) -> Vectors:
+    """Build the vectors of the models of a batch or, with `owner`, of its baselines."""
     widths = np.array([basis.shape[1] for basis in batch.bases])
     stack = np.zeros((len(widths), widths.max(), len(span)))
     for row, basis in zip(stack, batch.bases, strict=True):

@@ -43,12 +43,8 @@ FINITE_KERNEL_RIDGE = {tf.float32: 1e-6, tf.float64: 1e-12}
 class Roots(NamedTuple):
     """Roots S of the foregrounds' response ``Q S^T S Q^T y`` to a weighted change y, with the span Q of a batch.
 
-    Attributes
-    ----------
-    first
-        S of the models of a batch, or of its baselines if they have their own coefficients besides the shared ones,
-        (N, Nvec, rank).
-    shared : S of the shared coefficients, (Nmodels, Nvec, rank), if there are both kinds; None otherwise
+    S is (N, Nvec, rank): `first` of the models of a batch, or, if its baselines have their own coefficients besides the
+    `shared` ones, of these baselines.
     """
 
     first: tf.Tensor
@@ -67,15 +63,11 @@ class Linearization(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """The reduced problem at given gains.
+    """The reduced problem at given gains, in float64.
 
-    Attributes
-    ----------
-    loss
-        sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior; scalar, float64.
-    model : F on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), float64
-    descent : minus half the gradient of the loss in eta, shape (2, Nants, Nfreqs), float64
-    parts : linearizations of the stretches
+    `loss` is sum w |V - G F|^2 at the best foregrounds, plus the squares of coefficients that have a prior. `model` is
+    F on the baselines of consecutive stretches, each (2, Nbls, Nfreqs), and `parts` are their linearizations. `descent`
+    is minus half the gradient of the loss in eta, (2, Nants, Nfreqs).
     """
 
     loss: tf.Tensor
@@ -89,10 +81,7 @@ class Projection(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Consecutive batches whose elementwise products on baselines are computed at once.
-
-    `baselines` are the first one and one past the last, in the solvers' order.
-    """
+    """Consecutive batches, from the first to one past the last of `baselines`, whose products are made at once."""
 
     baselines: tuple[int, int]
     ends: Ends
@@ -106,22 +95,17 @@ class Stretch(NamedTuple):
 class Projector:
     """Eliminates the foregrounds of one fit structure.
 
-    Parameters
-    ----------
-    dtype
-        Precision of the inner products of the iteration. float32 is enough, except close to a minimum far below the
-        data. The loss, its gradient and N are always evaluated in float64: in float32 the scale of the gains drifts.
-    twice
-        Project the foregrounds out of the residual, or of a change, a second time. Its rounding has a part that they
-        absorb, and gains that they can follow have derivatives below it. Without effect if the prior is finite:
-        foregrounds would respond to the remaining residual as well, and such derivatives are larger.
+    `dtype` is the precision of the inner products of the iteration. float32 is enough, except close to a minimum far
+    below the data. The loss, its gradient and N are always evaluated in float64: in float32 the scale of the gains
+    drifts.
 
-    Attributes
-    ----------
-    stretches
-        The batches with their vectors. In large fits each is processed by itself, so that its temporary arrays stay in
-        the cache; in others the elementwise products are computed for all baselines at once, in fewer operations.
-    common : orthonormal basis that spans all bases, (Nfreqs, rank), of `dtype`
+    With `twice`, foregrounds are projected out of the residual, or of a change, a second time. Its rounding has a part
+    that they absorb, and gains that they can follow have derivatives below it. It has no effect if the prior is finite:
+    foregrounds would respond to the remaining residual as well, and such derivatives are larger.
+
+    `stretches` are the batches with their vectors. In large fits each is processed by itself, so that its temporary
+    arrays stay in the cache; in others the elementwise products are computed for all baselines at once, in fewer
+    operations. `common` is an orthonormal basis that spans all bases, (Nfreqs, rank).
     """
 
     def __init__(
@@ -318,18 +302,15 @@ class Projector:
 
     def hessian_product(self, eta: tf.Tensor, projection: Projection) -> tf.Tensor:
         """Return the Gauss-Newton matrix of the reduced problem times eta, shape (2, Nants, Nfreqs)."""
-        return self._over_stretches(self._hessian_part, eta, projection)
 
-    def _hessian_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
-        """Return the part of a stretch in `hessian_product`."""
-        change = self._products.change(eta, stretch.ends, part.curvature, part.model)
-        return self._pulled(change, stretch, part)
+        def of_stretch(eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+            change = self._products.change(eta, stretch.ends, part.curvature, part.model)
+            return self._pulled(change, stretch, part)
+
+        return self._over_stretches(of_stretch, eta, projection)
 
     def _pulled(self, change: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
-        """Return F* (y - D x) summed by antenna, (2, Nants, Nfreqs).
-
-        y is a weighted change, and x the response of the foregrounds.
-        """
+        """Return F* (y - D x) summed by antenna, for a weighted change y and the response x of the foregrounds."""
         answer = self._answer(stretch, change, part)
         if self._twice:
             change -= part.curvature * answer
@@ -337,10 +318,7 @@ class Projector:
         return self._products.pull(change, answer, stretch.ends, part.curvature, part.model)
 
     def descent_by(self, difference: tf.Tensor, projection: Projection) -> tf.Tensor:
-        """Return half of what the negative gradient gains where data differ by G times `difference`, (2, Nbls, Nfreqs).
-
-        Foregrounds respond. The shape is (2, Nants, Nfreqs).
-        """
+        """Return half of what the negative gradient gains where data differ by G times `difference`."""
 
         def of_stretch(rows: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
             return self._pulled(part.curvature * rows[:, slice(*stretch.baselines)], stretch, part)
@@ -348,10 +326,7 @@ class Projector:
         return self._over_stretches(of_stretch, difference, projection)
 
     def left_of(self, difference: tf.Tensor, eta: tf.Tensor, projection: Projection) -> tuple[tf.Tensor, ...]:
-        """Return the rest of a difference of the data after gains change by eta and foregrounds respond, times D.
-
-        The difference is (2, Nbls, Nfreqs), in the unit of the foregrounds. Results are those of consecutive stretches.
-        """
+        """Return the rest of a difference of the data after gains and foregrounds respond, times D, of each stretch."""
         found = []
         for stretch, part in zip(self.stretches, projection.parts, strict=True):
             change = part.curvature * difference[:, slice(*stretch.baselines)]
@@ -365,14 +340,14 @@ class Projector:
         Along g exp(t eta), with foregrounds that follow as F + t dF, the second derivative of G F in t is
         G ((eta_a + eta_b*)^2 F + 2 (eta_a + eta_b*) dF). Shape (2, Nants, Nfreqs).
         """
-        return -self._over_stretches(self._second_derivative_part, eta, projection)
 
-    def _second_derivative_part(self, eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
-        """Return the part of a stretch in minus `curvature_descent`."""
-        ends, curvature, model = stretch.ends, part.curvature, part.model
-        first = self._products.change(eta, ends, curvature, model)
-        second = pairs.multiply(model, ends.relative_change(eta)) - 2 * self._answer(stretch, first, part)
-        return self._pulled(self._products.change(eta, ends, curvature, second), stretch, part)
+        def of_stretch(eta: tf.Tensor, stretch: Stretch, part: Linearization) -> tf.Tensor:
+            ends, curvature, model = stretch.ends, part.curvature, part.model
+            first = self._products.change(eta, ends, curvature, model)
+            second = pairs.multiply(model, ends.relative_change(eta)) - 2 * self._answer(stretch, first, part)
+            return self._pulled(self._products.change(eta, ends, curvature, second), stretch, part)
+
+        return -self._over_stretches(of_stretch, eta, projection)
 
     def _over_stretches(
         self, function: Callable[[tf.Tensor, Stretch, Linearization], tf.Tensor], eta: tf.Tensor, projection: Projection

@@ -51,41 +51,25 @@ class Ends(NamedTuple):
         return tf.stack([a_real + b_real, a_imaginary - b_imaginary])
 
     def sum_over_antenna(self, values: tf.Tensor, n_antennas: int) -> tf.Tensor:
-        """Add each baseline to a and its conjugate to b, the transpose of `relative_change`.
-
-        (2, Nbls, Nfreqs) to (2, Nants, Nfreqs).
-        """
-
-        def scatter(part: tf.Tensor, index: tf.Tensor) -> tf.Tensor:
-            return tf.math.unsorted_segment_sum(part, index, n_antennas)
-
-        real, imaginary = tf.unstack(values)
-        of_real = scatter(real, self.first) + scatter(real, self.second)
-        of_imaginary = scatter(imaginary, self.first) - scatter(imaginary, self.second)
-        return tf.stack([of_real, of_imaginary])
+        """Add each baseline to a, its conjugate to b, (2, Nbls, Nfreqs) to (2, Nants, Nfreqs): `relative_change`^T."""
+        (a_real, b_real), (a_imaginary, b_imaginary) = (
+            [tf.math.unsorted_segment_sum(part, index, n_antennas) for index in self] for part in tf.unstack(values)
+        )
+        return tf.stack([a_real + b_real, a_imaginary - b_imaginary])
 
 
 class FitTensors:
     """Index tensors of one `FitStructure`.
 
-    Attributes
-    ----------
-    shared : whether any baselines share a model
-    model_index : model of each baseline, shape (Nbls,), int32, ascending; None if each baseline is its own model
-    slices : range of models of each bucket
-    bases : basis of each bucket, shape (Nfreqs, Nvec), float64 arrays
-    batches
-        Batches of models that are processed one after the other: the temporary arrays of one batch bound the memory,
-        and the size of compiled graphs grows with the number of batches.
-    orientation : 1, or -1 for reversed baselines, shape (Nbls, 1); None if there are none
+    `shared` says whether any baselines share a model; `model_index`, that of each baseline, (Nbls,), ascending, is None
+    if none do. `slices` are the models of each bucket, and `bases` their vectors, (Nfreqs, Nvec). `batches` of models
+    are processed one after the other: the temporary arrays of one bound the memory, and the size of compiled graphs
+    grows with their number. `orientation` is 1, or -1 for reversed baselines, (Nbls, 1); None if there are none.
     """
 
     def __init__(self, structure: FitStructure) -> None:
         buckets = structure.basis.buckets
-        model_order = np.concatenate([bucket.members for bucket in buckets])
-        model_position = np.empty(structure.basis.n_models, int)
-        model_position[model_order] = np.arange(structure.basis.n_models)
-        position = model_position[structure.groups]
+        position = np.argsort(np.concatenate([bucket.members for bucket in buckets]))[structure.groups]
         self._order = np.argsort(position, kind="stable")
         self._conjugated = structure.conjugated[self._order]
         pairs_sorted = structure.antennas[self._order]
@@ -97,21 +81,19 @@ class FitTensors:
         self.ends = Ends(*(tf.constant(index, tf.int32) for index in pairs_sorted.T))
         self.shared = self.n_models < self.n_baselines
         self.model_index = tf.constant(position[self._order], tf.int32) if self.shared else None
-        edges = np.cumsum([0, *(bucket.members.size for bucket in buckets)]).tolist()
-        self.slices = list(pairwise(edges))
+        sizes = [bucket.members.size for bucket in buckets]
+        self.slices = list(pairwise(np.cumsum([0, *sizes]).tolist()))
         self.bases = [bucket.vectors for bucket in buckets]
         # The first baseline of each model, and one past the last of all.
         self._baseline_edges = np.searchsorted(position[self._order], np.arange(self.n_models + 1))
-        sizes = [bucket.members.size for bucket in buckets]
         self.batches = make_batches(self.bases, sizes, self._baseline_edges, structure.models_at_once)
         self.orientation = np.where(self._conjugated, -1.0, 1.0)[:, None] if self._conjugated.any() else None
 
     def load(self, problem: CalibrationProblem, dtype: tf.DType) -> SortedData:
         """Return the problem's data as tensors of `dtype`."""
         visibilities, weights = problem.visibilities[self._order], problem.weights[self._order]
-        visibilities = np.where(self._conjugated[:, None], visibilities.conj(), visibilities)
         scale = float(np.sqrt(np.sum(weights * np.abs(visibilities) ** 2) / np.sum(weights)))
-        return SortedData(pairs.to_pair(visibilities / scale, dtype), tf.constant(weights, dtype), scale)
+        return SortedData(self.load_model(problem.visibilities, scale, dtype), tf.constant(weights, dtype), scale)
 
     def ordered(self, weights: np.ndarray) -> tf.Tensor:
         """Return weights of the problem's baselines, (Nbls, Nfreqs), in the solvers' order, in double precision."""
@@ -215,10 +197,7 @@ class BaselineProducts:
     def _pull(
         self, change: tf.Tensor, answer: tf.Tensor | None, ends: Ends, curvature: tf.Tensor, model: tf.Tensor
     ) -> tf.Tensor:
-        """Return F* (y - D x) summed by antenna, (2, Nants, Nfreqs).
-
-        y is a weighted change, and x the response of the foregrounds.
-        """
+        """Return F* (y - D x) summed by antenna, for a weighted change y and the response x of the foregrounds."""
         left = change if answer is None else change - curvature * answer
         return ends.sum_over_antenna(pairs.conjugate_multiply(model, left), self._n_antennas)
 
@@ -228,8 +207,7 @@ class GainSpace:
 
     Solvers iterate on relative changes eta of the gains, g (1 + eta). A basis B changes coordinates, eta = (c B^T) / g.
 
-    The basis is orthonormal, (Nfreqs, Ngain), as from `calstudy.calibrate.basis.gain_vectors`, or None for no
-    restriction. `dtype` is that of all tensors.
+    The basis is orthonormal, (Nfreqs, Ngain), or None for no restriction. `dtype` is that of all tensors.
     """
 
     def __init__(self, vectors: np.ndarray | None, dtype: tf.DType) -> None:

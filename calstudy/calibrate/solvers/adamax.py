@@ -8,7 +8,7 @@ where the problem has it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -32,7 +32,6 @@ PARTS = 8
 
 
 Precision = Literal["single", "double"]
-Stop = Literal["best-loss", "published"]
 
 # Decay of the moments and the guard of the denominator: Kingma & Ba (2014), Keras' defaults.
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-7
@@ -40,9 +39,9 @@ STEPS_PER_CALL = 50
 
 
 class Parameters(NamedTuple):
-    """Unknowns or anything of their shape: gains (2, Nants, Nfreqs) and one (2, Nmembers, Nvec) per bucket.
+    """Unknowns or anything of their shape: gains, or their coefficients in a smooth basis, (2, Nants, Nfreqs or Ngain).
 
-    Gains in a smooth basis are its coefficients, (2, Nants, Ngain). With frozen foregrounds there is none.
+    Coefficients of foregrounds are (2, Nmembers, Nvec) of each bucket; none if these are frozen.
     """
 
     gains: tf.Tensor
@@ -198,6 +197,10 @@ class JointLoss:
         return tf.add_n(values), Parameters(self._space.reduce(tf.add_n(of_gains)), tuple(of_coefficients))
 
 
+_map = tf.nest.map_structure
+"""Apply a function to all tensors of one or more parameters."""
+
+
 class Descent(NamedTuple):
     """Parameters, first and second moments of the gradient after a step, and the parameters with the lowest loss."""
 
@@ -205,11 +208,6 @@ class Descent(NamedTuple):
     moments: tuple[Parameters, Parameters]
     best: Parameters
     best_loss: tf.Tensor
-
-
-def _map(function: Callable[..., tf.Tensor], *parameters: Parameters) -> Parameters:
-    """Apply a function to all tensors of one or more parameters of the same structure."""
-    return tf.nest.map_structure(function, *parameters)
 
 
 def update(
@@ -243,16 +241,15 @@ class JointKernels:
         exact = self.tensors.load(problem, tf.float64)
         start = pairs.to_pair(gains, tf.float64)
         coefficients: tuple[tf.Tensor, ...] = ()
-        model = None
+        model, target, summed = None, 0j, ()
         if (frozen := problem.frozen_model) is not None:
             model = self.tensors.load_model(frozen, exact.scale, self.dtype)
         else:
             best = self.projector.project(start, exact.visibilities, exact.weights).model
             coefficients = self.loss.coefficients(self.tensors.of_models(tf.concat(best, axis=1)))
-        target = np.array(0j if problem.frozen else problem.prior_target / exact.scale)
+            target, summed = problem.prior_target / exact.scale, self.loss.summed(self.tensors.ordered(problem.summing))
         visibilities, weights = (tf.cast(part, self.dtype) for part in (exact.visibilities, exact.weights))
-        summed = () if problem.frozen else self.loss.summed(self.tensors.ordered(problem.summing))
-        data = FitData(visibilities, weights, pairs.to_pair(target, self.dtype), summed, model)
+        data = FitData(visibilities, weights, pairs.to_pair(np.array(target), self.dtype), summed, model)
         return Parameters(self.space.reduce(tf.cast(start, self.dtype)), coefficients), data, exact.scale
 
     def estimate(self, parameters: Parameters, data: FitData, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -296,27 +293,18 @@ class AdamaxState:
 
 @dataclass(frozen=True)
 class Adamax:
-    """Descent with a constant learning rate.
+    """Descent with a constant learning rate; fields are as in `calstudy.calibrate.settings.AdamaxSettings`.
 
-    Parameters
-    ----------
-    learning_rate : size of the first step, for visibilities in units of their rms
-    max_steps : number of the last step
-    tolerance : in units of the data's mean square. With zero, the number of steps is fixed.
-    precision : Float32 or float64 throughout
-    stop
-        ``best-loss``: when the best loss falls by less than the tolerance over `STEPS_PER_CALL` steps. ``published``:
-        the rule of the paper's authors, one step after a loss that differs from the loss before it by less than the
-        tolerance. In single precision with a tolerance of 1e-14 that is when two consecutive losses are equal, which
-        happens by chance once the loss falls slowly.
-    keep : return the ``best`` parameters, or the ``last``, as the authors do
+    The ``published`` rule is one step after a loss that differs from the loss before it by less than the tolerance. In
+    single precision with a tolerance of 1e-14 that is when two consecutive losses are equal, which happens by chance
+    once the loss falls slowly.
     """
 
     learning_rate: float = 0.01
     max_steps: int = 10_000
     tolerance: float = 1e-14
     precision: Precision = "single"
-    stop: Stop = "best-loss"
+    stop: Literal["best-loss", "published"] = "best-loss"
     keep: Literal["best", "last"] = "best"
 
     @property
@@ -373,11 +361,11 @@ class Adamax:
             if abs(before - float(state.descent.best_loss)) < self.tolerance:
                 message = f"the best loss fell by less than {self.tolerance:g} over {STEPS_PER_CALL} steps"
                 return Solve("converged", message)
-        if n_steps >= self.max_steps:
-            if self.tolerance == 0:
-                return Solve("max-steps", f"stopped after {n_steps} steps, a fixed number (tolerance: 0)")
-            return Solve("max-steps", f"not converged after {n_steps} steps")
-        return None
+        if n_steps < self.max_steps:
+            return None
+        if self.tolerance == 0:
+            return Solve("max-steps", f"stopped after {n_steps} steps, a fixed number (tolerance: 0)")
+        return Solve("max-steps", f"not converged after {n_steps} steps")
 
     def losses(self, state: AdamaxState) -> Sequence[float]:
         """Return the loss history, prior included, in the unit of the data squared."""

@@ -83,21 +83,14 @@ class AntennaPreconditioner(NamedTuple):
 class GaussNewtonState:
     """One point of the iteration; losses are relative to the weighted square of the data.
 
-    Attributes
-    ----------
-    reduced : the data, and the gains that the iteration started from
-    channel_steps
-        Number of accepted steps until the antenna blocks are made: zero near a minimum, as at a warm start or a check
-        of convergence.
-    boost : factor on the damping; grows whenever a step did not lower the loss
-    relief : another factor, of one or of `CHECK_DAMPING`
-    checked : whether the prediction comes from a check of convergence
-    preconditioner : the antenna blocks, once they are in use
-    gained
-        Decrease of the loss by the last step that lowered it; infinite before the first. Where the damping stays
-        raised, multiplied by its factor: the decrease along slow directions is about inversely proportional to the
-        damping.
-    predicted : decrease of the loss that is predicted for the next step; infinite while unknown
+    Antenna blocks, the preconditioner, are made after `channel_steps` more accepted steps: zero near a minimum, as at a
+    warm start or a check of convergence. `boost` is a factor on the damping, which grows whenever a step did not lower
+    the loss, and `relief` another one, of one or of `CHECK_DAMPING`.
+
+    `gained` is the decrease of the loss by the last step that lowered it; infinite before the first. Where the damping
+    stays raised, it is multiplied by its factor: the decrease along slow directions is about inversely proportional to
+    the damping. `predicted` is what is predicted for the next step; infinite while unknown. It comes from a check of
+    convergence if that is `checked`.
     """
 
     kernels: ReducedKernels
@@ -118,6 +111,12 @@ class GaussNewtonState:
         """Damping of the next step, relative to the diagonal of the Gauss-Newton matrix."""
         tied = self.relief * self.kernels.damping(self.history[-1])
         return max(tied, self.kernels.dampings.least) * self.boost
+
+    @property
+    def equations(self) -> tuple[Projection, tf.Tensor, Inverse | None, tf.Tensor]:
+        """The reduced problem, its gains, the preconditioner's inverse if it has antenna blocks, and the damping."""
+        inverse = None if self.preconditioner is None else self.preconditioner.inverse
+        return self.projection, self.gains, inverse, self.kernels.scalar(self.damping)
 
     @property
     def beyond_single(self) -> bool:
@@ -155,32 +154,19 @@ class GaussNewtonState:
         return self.predicted / (1 - shrinking) / self.history[-1] if shrinking < 1 else math.inf
 
 
-class Blocks(NamedTuple):
-    """The antenna blocks of a fit, and its structure."""
-
-    structure: FitStructure
-    preconditioner: AntennaPreconditioner
-
-
 @dataclass(frozen=True)
 class GaussNewton:
     """Variable projection with a damped Gauss-Newton iteration.
 
-    Parameters
-    ----------
-    tolerance
-        Converged when the next step is predicted to lower the loss by less than this fraction, and either the last
-        step did not lower it more, or all further steps together will not, if they shrink at the same rate. A fit with
-        a long sequence of smaller decreases counts as converged.
-    max_steps : maximum number of Gauss-Newton steps
-    precision
-        Precision of the inner products. Where single precision does not resolve the damping for the loss, ``double``
-        continues, and ``single`` is stalled if a larger decrease is possible. Fits with a finite prior that are slow
-        there continue in double precision either way, with ``single`` down to the damping that is tied to the loss.
-    patience
-        Number of steps after which a fit with a finite prior counts as slow; with zero it is in double precision
-        wherever single precision does not resolve the damping.
-    check : check convergence with less damping where the damping may hide directions that matter
+    It is converged when the next step is predicted to lower the loss by less than the fraction `tolerance`, and either
+    the last step did not lower it more, or all further steps together will not, if they shrink at the same rate. A fit
+    with a long sequence of smaller decreases counts as converged.
+
+    Where single precision of the inner products does not resolve the damping for the loss, ``double`` continues, and
+    ``single`` is stalled if a larger decrease is possible. Fits with a finite prior that are slow there continue in
+    double precision either way, with ``single`` down to the damping that is tied to the loss. They count as slow after
+    `patience` steps; with zero they are in double precision wherever single precision does not resolve the damping.
+    `check` is whether convergence is checked with less damping where the damping may hide directions that matter.
     """
 
     tolerance: float = 1e-3
@@ -196,10 +182,10 @@ class GaussNewton:
 
     def init(self, problem: CalibrationProblem, warm: WarmStart | None = None) -> GaussNewtonState:
         """Project at the first gains, and reuse the preconditioner of the warm start."""
-        kept: Blocks | None = None if warm is None else warm.memory
+        structure, memory = (None, None) if warm is None or warm.memory is None else warm.memory
         # Smooth gains of integrations with other flagged edges have other coefficients.
-        fits = kept is not None and (kept.structure == problem.structure or problem.structure.gain_vectors is None)
-        memory = kept.preconditioner if kept is not None and fits else None
+        if structure != problem.structure and problem.structure.gain_vectors is not None:
+            memory = None
         kernels = compiled(problem.structure, problem.frozen)
         reduced = kernels.reduce(problem, problem.initial_gains if warm is None else warm.gains)
         projection = kernels.project(reduced.gains, *reduced.data)
@@ -226,7 +212,8 @@ class GaussNewton:
         kernels = state.kernels
         state, step = self._curved_step(state) if state.curved else (state, self._plain_step(state))
         relative = tf.cast(step.eta, tf.float64)
-        gains = pairs.multiply(state.gains, pairs.exponential(relative) if state.curved else _one_plus(relative))
+        factor = pairs.exponential(relative) if state.curved else tf.stack([1 + relative[0], relative[1]])
+        gains = pairs.multiply(state.gains, factor)
         trial = kernels.project(gains, *state.reduced.data)
         loss = float(trial.loss)
         # This also refuses a loss that is not a number, and a missing step, from blocks that are singular in float32.
@@ -268,13 +255,13 @@ class GaussNewton:
                 f"{fall:.1e} of the loss is predicted to go, in directions that single precision does not resolve "
                 "(a solver with 'precision: double' goes on)",
             )
-        hint = f"{fall:.1e} of {{}} is predicted to go" if math.isfinite(fall) else ""
+        known = math.isfinite(fall)
         if state.damping > MAX_DAMPING:
-            return Solve("stalled", f"no step lowers the loss{', though ' + hint.format('it') if hint else ''}")
+            hint = f", though {fall:.1e} of it is predicted to go" if known else ""
+            return Solve("stalled", f"no step lowers the loss{hint}")
         if n_steps >= self.max_steps:
-            return Solve(
-                "max-steps", f"not converged after {n_steps} steps{': ' + hint.format('the loss') if hint else ''}"
-            )
+            hint = f": {fall:.1e} of the loss is predicted to go" if known else ""
+            return Solve("max-steps", f"not converged after {n_steps} steps{hint}")
         return None
 
     @property
@@ -310,21 +297,14 @@ class GaussNewton:
 
     def _plain_step(self, state: GaussNewtonState) -> _Step:
         """Solve the damped normal equations."""
-        kernels, preconditioner = state.kernels, state.preconditioner
-        damping = kernels.scalar(state.damping)
-        if preconditioner is None:
-            eta, promised = kernels.channel_step(state.projection, state.gains, damping)
-            return _Step(eta, float(promised), False)
-        eta, promised, iterations = kernels.antenna_step(state.projection, state.gains, preconditioner.inverse, damping)
+        eta, promised, iterations = state.kernels.step(*state.equations)
         return _Step(eta, float(promised), bool(iterations > CG_REFRESH))
 
     def _curved_step(self, state: GaussNewtonState) -> tuple[GaussNewtonState, _Step]:
         """Raise the damping until the step is nearly straight; return the state and the step with its acceleration."""
         while True:
             step = self._plain_step(state)
-            inverse = None if state.preconditioner is None else state.preconditioner.inverse
-            arguments = state.projection, state.gains, inverse, state.kernels.scalar(state.damping), step.eta
-            acceleration = state.kernels.accelerate(*arguments)
+            acceleration = state.kernels.accelerate(*state.equations, step.eta)
             relative = float(tf.norm(acceleration) / tf.norm(step.eta))
             # Written so that NaN counts as curved.
             if relative < TOO_CURVED or state.damping > MAX_DAMPING:
@@ -360,14 +340,14 @@ class GaussNewton:
             return self._checked(state).predicted / loss
         return newton_decrement_at(problem, pairs.to_complex(state.gains))
 
-    def memory(self, state: GaussNewtonState) -> Blocks | None:
-        """Return the antenna blocks, which change little from one integration to the next.
+    def memory(self, state: GaussNewtonState) -> tuple[FitStructure, AntennaPreconditioner] | None:
+        """Return the structure and the antenna blocks, which change little from one integration to the next.
 
         Those of double precision are not kept: each integration decides by itself whether it continues there.
         """
         if state.preconditioner is None or state.kernels.dtype != tf.float32:
             return None
-        return Blocks(state.kernels.structure, state.preconditioner)
+        return state.kernels.structure, state.preconditioner
 
     def _prepared(self, state: GaussNewtonState) -> GaussNewtonState:
         """Adapt the antenna blocks to the damping of the state, or compute them, and predict the next step."""
@@ -404,10 +384,6 @@ class _Step(NamedTuple):
     eta: tf.Tensor
     promised: float
     outdated: bool
-
-
-def _one_plus(values: tf.Tensor) -> tf.Tensor:
-    return tf.stack([1 + values[0], values[1]])
 
 
 def _next_boost(boost: float, gain: float) -> float:

@@ -55,10 +55,7 @@ def antenna_degrees(tensors: FitTensors, projection: Projection) -> tf.Tensor:
 
 
 class ChannelInverse(NamedTuple):
-    """Inverse of the antenna blocks of each channel.
-
-    `factors` are Cholesky factors, for real and for imaginary parts of eta, (2, Nfreqs, Nants, Nants).
-    """
+    """Cholesky factors of the antenna blocks of channels, for real and imaginary parts, (2, Nfreqs, Nants, Nants)."""
 
     factors: tf.Tensor
 
@@ -72,8 +69,7 @@ def channel_inverse(tensors: FitTensors, projection: Projection, damping: tf.Ten
     """Invert the damped antenna blocks of each channel.
 
     Foregrounds are held fixed in these blocks, so that real and imaginary parts of eta decouple: the blocks are the
-    degree plus and minus the coupling matrix. The damping is relative to the diagonal, scalar, in the precision of the
-    projection.
+    degree plus and minus the coupling matrix.
     """
     shape = [tensors.n_antennas, tensors.n_antennas, tensors.n_frequencies]
     coupling = tf.transpose(tf.scatter_nd(tf.stack(tensors.ends, axis=1), projection.power(), shape), [2, 0, 1])
@@ -138,10 +134,9 @@ def _absorbed(projector: Projector, piece: Piece, span: tf.Tensor | None, part: 
 
 
 class AntennaInverse(NamedTuple):
-    """Inverse of the channel blocks of each antenna, ``diagonal + Q correction Q^T``.
+    """Inverse of the channel blocks of each antenna, ``diagonal + Q correction Q^T``, with Q = `common`.
 
-    `common` is Q, (Nfreqs, rank), and `diagonal` is 1 / ((1 + damping) K), (Nants, Nfreqs). `correction` is Hermitian,
-    real and imaginary part, (2, Nants, rank, rank).
+    `diagonal` is 1 / ((1 + damping) K); `correction` is Hermitian, real and imaginary part, (2, Nants, rank, rank).
     """
 
     common: tf.Tensor
@@ -171,17 +166,10 @@ def antenna_inverse(blocks: AntennaBlocks, damping: tf.Tensor) -> AntennaInverse
 class CoupledBlocks(NamedTuple):
     """The Gauss-Newton matrix on the span of the common basis, for baselines that each have their own model.
 
-    A baseline depends on eta_a + eta_b*. Real parts of both antennas have the same matrix, `alike`. Imaginary parts
-    have its negative between the two antennas. Real parts couple to imaginary ones by `crossed`, negative for those of
-    the second antenna.
-
-    Attributes
-    ----------
-    degrees : K, (Nants, Nfreqs)
-    common : Q, (Nfreqs, rank)
-    gram : Q^T K Q, (Nants, rank, rank)
-    alike : symmetric part of Q^T (D |F|^2 - C) Q of each baseline, (Nbls, rank, rank)
-    crossed : antisymmetric part of Q^T C Q, of the same shape
+    A baseline depends on eta_a + eta_b*. Real parts of both antennas have the same matrix, `alike`, the symmetric part
+    of Q^T (D |F|^2 - C) Q of each baseline, (Nbls, rank, rank). Imaginary parts have its negative between the two
+    antennas. Real parts couple to imaginary ones by `crossed`, the antisymmetric part of Q^T C Q, negative for those of
+    the second antenna. `degrees`, `common` and `gram` are as in `AntennaBlocks`.
     """
 
     degrees: tf.Tensor
@@ -215,10 +203,9 @@ def coupled_blocks(projector: Projector, projection: Projection) -> CoupledBlock
 
 
 class CoupledInverse(NamedTuple):
-    """Inverse of the damped coupled blocks.
+    """Inverse of the damped coupled blocks, by the Cholesky factor of their matrix; Q and diagonal as `AntennaInverse`.
 
-    `common` is Q, (Nfreqs, rank), and `diagonal` is 1 / ((1 + damping) K), (Nants, Nfreqs). `factor` is the Cholesky
-    factor of the damped matrix, and `gram_inverse` the inverse of (1 + damping) Q^T K Q, (Nants, rank, rank).
+    `gram_inverse` is the inverse of (1 + damping) Q^T K Q, (Nants, rank, rank).
     """
 
     common: tf.Tensor
@@ -235,10 +222,7 @@ class CoupledInverse(NamedTuple):
 
 
 def coupled_inverse(blocks: CoupledBlocks, ends: Ends, damping: float) -> CoupledInverse:
-    """Invert the damped coupled blocks, in double precision; all NaN if rounding has left them indefinite.
-
-    The damping is relative to the diagonal.
-    """
+    """Invert the damped coupled blocks, in double precision; all NaN if rounding has left them indefinite."""
     matrix, gram = blocks.matrix(ends), blocks.gram.numpy()
     n_antennas, rank = gram.shape[:2]
     parts = matrix.reshape(2, n_antennas, rank, 2, n_antennas, rank)
@@ -257,10 +241,7 @@ def coupled_inverse(blocks: CoupledBlocks, ends: Ends, damping: float) -> Couple
 
 
 class CoordinateInverse(NamedTuple):
-    """Inverse of the blocks of each antenna for coordinates.
-
-    `factors` are Cholesky factors, (Nants, Ngain, Ngain), complex64.
-    """
+    """Cholesky factors of the blocks of each antenna for coordinates, (Nants, Ngain, Ngain), complex64."""
 
     factors: tf.Tensor
 
@@ -271,10 +252,7 @@ class CoordinateInverse(NamedTuple):
 
 
 def coordinate_inverse(blocks: AntennaBlocks, columns: tf.Tensor, damping: tf.Tensor) -> CoordinateInverse:
-    """Invert the damped blocks for gains in a space of smooth ones.
-
-    `columns` are relative changes of gains for a unit of each coordinate, (Nants, Nfreqs, Ngain), complex64.
-    """
+    """Invert the damped blocks for gains in a space of smooth ones, with columns of `GainSpace.columns`."""
     diagonal = tf.cast((1 + damping) * blocks.degrees, columns.dtype)
     matrix = tf.matmul(columns, diagonal[:, :, None] * columns, adjoint_a=True)
     if blocks.absorbed is not None:

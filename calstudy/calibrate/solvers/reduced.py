@@ -91,12 +91,9 @@ class FrozenForegrounds:
 class Dampings(NamedTuple):
     """Dampings relative to the diagonal.
 
-    Attributes
-    ----------
-    per_loss : damping over the loss relative to the data; the damping is `MOST_DAMPING` at most
-    least : smallest damping that products in a precision can resolve
-    preconditioner : smallest damping with which blocks in a precision can be inverted
-    remembered : whether the damping stays raised for the next steps
+    `per_loss` is that over the loss relative to the data, `least` the smallest that products in a precision can
+    resolve, and `preconditioner` the smallest with which blocks can be inverted. `remembered` ones stay raised for the
+    next steps.
     """
 
     per_loss: float
@@ -113,15 +110,11 @@ FINITE = {tf.float32: Dampings(0.1, 1e-7, 1e-6, True), tf.float64: Dampings(0.1,
 
 
 class ReducedData(NamedTuple):
-    """The arrays of a reduced problem.
+    """The arrays of a reduced problem, in float64.
 
-    Attributes
-    ----------
-    gains : gains to start from, (2, Nants, Nfreqs), float64
-    data
-        Visibilities (2, Nbls, Nfreqs), weights (Nbls, Nfreqs) whose sum is one, and the model if it is frozen; float64.
-    scale : unit of the visibilities, their weighted rms
-    loss_unit : unit of the loss, in the unit of the data squared
+    Gains to start from are (2, Nants, Nfreqs). Data are visibilities (2, Nbls, Nfreqs), in the unit `scale`, their
+    weighted rms; weights (Nbls, Nfreqs) whose sum is one; and the model if it is frozen, or mean and deviations of a
+    finite prior. `loss_unit` is the unit of the loss, in the unit of the data squared.
     """
 
     gains: tf.Tensor
@@ -131,10 +124,7 @@ class ReducedData(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """The damped Gauss-Newton equations at gains (2, Nants, Nfreqs), and the inverse of their preconditioner.
-
-    The damping is relative to the diagonal, scalar.
-    """
+    """The Gauss-Newton equations at gains, with a damping relative to the diagonal, and a preconditioner's inverse."""
 
     projection: Projection
     gains: tf.Tensor
@@ -165,17 +155,11 @@ def as_graph(function: Callable[..., Any]) -> Callable[..., Any]:
 class ReducedKernels:
     """The compiled operations on the reduced problem of one fit structure.
 
-    Attributes
-    ----------
-    by_channel
-        Whether the antenna blocks of each channel are the preconditioner throughout: couplings between antennas remain
-        the strong ones where more than a few baselines share models without a finite prior, and are the only ones where
-        the foregrounds are frozen.
-    dampings : dampings of the fit in its precision
-    coupled
-        Whether the preconditioner has the couplings between smooth gains of all antennas, besides the blocks of each
-        antenna: for thorough kernels, if the array is not too large and each baseline has only its own model and
-        coefficients.
+    `by_channel` says whether the antenna blocks of each channel are the preconditioner throughout: couplings between
+    antennas remain the strong ones where more than a few baselines share models without a finite prior, and are the
+    only ones where the foregrounds are frozen. If `coupled`, the preconditioner has the couplings between smooth gains
+    of all antennas, besides the blocks of each antenna: for thorough kernels, if the array is not too large and each
+    baseline has only its own model and coefficients.
     """
 
     def __init__(
@@ -195,8 +179,7 @@ class ReducedKernels:
         self.space = GainSpace(structure.gain_vectors, dtype)
         self.exact_space = GainSpace(structure.gain_vectors, tf.float64)
         self.project = as_graph(self.projector.project)
-        self.channel_step = as_graph(self._channel_step)
-        self.antenna_step = as_graph(self._antenna_step)
+        self.step = as_graph(self._step)
         self.blocks = as_graph(self._blocks)
         self._antenna_inverse = as_graph(self._inverse)
         self.accelerate = as_graph(self._accelerate)
@@ -233,15 +216,26 @@ class ReducedKernels:
         start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
         return ReducedData(start, arrays, data.scale, total * data.scale**2)
 
-    def _channel_step(
-        self, projection: Projection, gains: tf.Tensor, damping: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta, and the decrease of the loss that its quadratic model predicts."""
-        inverse = channel_inverse(self.tensors, projection, damping)
-        descent = tf.cast(projection.descent, self.dtype)
-        equations = NormalEquations(projection, gains, damping, inverse)
-        eta, _ = self.solve(equations, descent, CG_TOLERANCE, CG_CHANNEL_ITERATIONS)
-        return eta, pairs.inner_product(descent, eta)
+    def _step(
+        self, projection: Projection, gains: tf.Tensor, inverse: Inverse | None, damping: tf.Tensor
+    ) -> tuple[tf.Tensor, tf.Tensor, tf.Tensor]:
+        """Return eta, the decrease of the loss that its quadratic model predicts, and the number of iterations.
+
+        With `inverse` of None, the preconditioner has the antenna blocks of each channel.
+        """
+        most = CG_CHANNEL_ITERATIONS if inverse is None else CG_ANTENNA_ITERATIONS
+        equations, descent = (
+            self._equations(projection, gains, inverse, damping),
+            tf.cast(projection.descent, self.dtype),
+        )
+        eta, iterations = self.solve(equations, descent, self.cg_tolerance, most)
+        return eta, pairs.inner_product(descent, eta), iterations
+
+    def _equations(
+        self, projection: Projection, gains: tf.Tensor, inverse: Inverse | None, damping: tf.Tensor
+    ) -> NormalEquations:
+        known = channel_inverse(self.tensors, projection, damping) if inverse is None else inverse
+        return NormalEquations(projection, gains, damping, known)
 
     def _accelerate(
         self, projection: Projection, gains: tf.Tensor, inverse: Inverse | None, damping: tf.Tensor, eta: tf.Tensor
@@ -249,32 +243,16 @@ class ReducedKernels:
         """Return the geodesic acceleration of a step eta (Transtrum & Sethna 2012), (2, Nants, Nfreqs).
 
         It solves the damped normal equations of the step for the second derivative of the residual along eta. Half of
-        it added to eta keeps a long step in a curved valley. With `inverse` of None, the preconditioner has the antenna
-        blocks of each channel.
+        it added to eta keeps a long step in a curved valley.
         """
-        if inverse is None:
-            inverse = channel_inverse(self.tensors, projection, damping)
-        equations = NormalEquations(projection, gains, damping, inverse)
+        equations = self._equations(projection, gains, inverse, damping)
         descent = self.projector.curvature_descent(eta, projection)
         return self.solve(equations, descent, self.cg_tolerance, CG_ANTENNA_ITERATIONS)[0]
-
-    def _antenna_step(
-        self, projection: Projection, gains: tf.Tensor, inverse: Inverse, damping: tf.Tensor
-    ) -> tuple[tf.Tensor, tf.Tensor, tf.Tensor]:
-        """Return eta, the decrease of the loss that its quadratic model predicts, and the number of iterations."""
-        descent = tf.cast(projection.descent, self.dtype)
-        equations = NormalEquations(projection, gains, damping, inverse)
-        eta, iterations = self.solve(equations, descent, self.cg_tolerance, CG_ANTENNA_ITERATIONS)
-        return eta, pairs.inner_product(descent, eta), iterations
 
     def solve(
         self, equations: NormalEquations, descent: tf.Tensor, tolerance: float, iterations: int
     ) -> tuple[tf.Tensor, tf.Tensor]:
-        """Return eta for a descent direction, both (2, Nants, Nfreqs), and the number of iterations.
-
-        `descent` is minus half the gradient in eta; for tolerance and iterations see
-        `calstudy.calibrate.solvers.preconditioners.conjugate_gradients`.
-        """
+        """Return eta for minus half a gradient, both (2, Nants, Nfreqs), and the number of iterations."""
         projection = equations.projection
         diagonal = equations.damping * antenna_degrees(self.tensors, projection)
         gains = tf.cast(equations.gains, self.dtype)
@@ -351,7 +329,7 @@ def newton_decrement_at(problem: CalibrationProblem, gains: np.ndarray) -> float
         return 0.0
     damping = kernels.damping(loss)
     if kernels.by_channel:
-        _, decrease = kernels.channel_step(projection, reduced.gains, kernels.scalar(damping))
+        _, decrease, _ = kernels.step(projection, reduced.gains, None, kernels.scalar(damping))
         return float(decrease) / loss
     stronger = kernels.scalar(max(damping, kernels.dampings.preconditioner))
     inverse = kernels.inverse(kernels.blocks(projection), stronger, reduced.gains)
