@@ -42,6 +42,11 @@ class Statistic:
         low, median, high = np.quantile(np.ravel(values), [0.16, 0.5, 0.84])
         return cls(float(median), float(high - low) / 2, int(np.size(values)), over)
 
+    @classmethod
+    def worst(cls, values: np.ndarray) -> Statistic:
+        """Return the largest of the values at delays."""
+        return cls(float(values.max()), 0.0, values.size, "delays")
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -137,20 +142,18 @@ def gain_errors(fitted: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
     aligned = aligned_gains(fit.gains, truth.gains)
-    error, raw_error = (gain_errors(gains, truth.gains) for gains in (aligned, fit.gains))
     power = [
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
-        for values in (aligned - truth.gains, truth.gains, fit.gains - truth.gains)
+        for values in (truth.gains, aligned - truth.gains, fit.gains - truth.gains)
     ]
-    by_delay = np.sqrt(power[0] / power[1])
-    raw_by_delay = np.sqrt(power[2] / power[1])
+    by_delay, raw_by_delay = (np.sqrt(part / power[0]) for part in power[1:])
     return {
-        "gains_aligned": Statistic.of(error, "antennas and integrations"),
-        "gains_raw": Statistic.of(raw_error, "antennas and integrations"),
+        "gains_aligned": Statistic.of(gain_errors(aligned, truth.gains), "antennas and integrations"),
+        "gains_raw": Statistic.of(gain_errors(fit.gains, truth.gains), "antennas and integrations"),
         "gains_by_delay": Statistic.of(by_delay, "delays"),
-        "gains_worst_delay": Statistic(float(by_delay.max()), 0.0, by_delay.size, "delays"),
+        "gains_worst_delay": Statistic.worst(by_delay),
         "gains_raw_by_delay": Statistic.of(raw_by_delay, "delays"),
-        "gains_raw_worst_delay": Statistic(float(raw_by_delay.max()), 0.0, raw_by_delay.size, "delays"),
+        "gains_raw_worst_delay": Statistic.worst(raw_by_delay),
     }
 
 
@@ -174,43 +177,37 @@ def _fitted_data(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Stat
     return {
         "product_over_noise": Statistic.of(error / _rms(noise, axis=(0, 2)), "baselines"),
         "product_over_data": Statistic.of(error / _rms(truth.data, axis=(0, 2)), "baselines"),
-        "product_worst_delay": Statistic(float(ratio.max()), 0.0, ratio.size, "delays"),
+        "product_worst_delay": Statistic.worst(ratio),
         **_correction(truth, fit, baselines),
     }
 
 
 def _correction(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
     """Return the gain-correction ratio beyond the wedge, over the noise relative to the foregrounds."""
-    outside = baselines.outside
-    used = outside.any(axis=1)
-    if not used.any():
-        return {}
     true, fitted = (gain_products(gains, baselines.antennas) for gains in (truth.gains, fit.gains))
     ratio = np.divide(true, fitted, out=np.ones_like(fitted), where=fitted != 0) - 1
     relative_noise = truth.noise / _rms(truth.foregrounds, axis=(0, 2))[:, None]
-    power = [_masked_mean(baselines.delay_power(values), outside)[used] for values in (ratio, relative_noise)]
-    return {"correction_over_noise_outside": Statistic.of(np.sqrt(power[0] / power[1]), "baselines")}
+    above, below = (baselines.delay_power(values) for values in (ratio, relative_noise))
+    return _ratio("correction_over_noise_outside", above, below, baselines.outside)
 
 
 def _residuals(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]:
     data, residual, noise = (baselines.delay_power(values) for values in (truth.data, fit.residual, truth.noise))
-    found = {}
-    for name, above, below, mask in (
-        ("residual_over_noise_outside", residual, noise, baselines.outside),
-        ("residual_over_noise_inside", residual, noise, baselines.inside),
-        ("data_over_residual_outside", data, residual, baselines.outside),
-        ("data_over_noise_outside", data, noise, baselines.outside),
-    ):
-        used = mask.any(axis=1)
-        if used.any():
-            ratio = _masked_mean(above, mask)[used] / _masked_mean(below, mask)[used]
-            found[name] = Statistic.of(np.sqrt(ratio), "baselines")
-    return found
+    return {
+        **_ratio("residual_over_noise_outside", residual, noise, baselines.outside),
+        **_ratio("residual_over_noise_inside", residual, noise, baselines.inside),
+        **_ratio("data_over_residual_outside", data, residual, baselines.outside),
+        **_ratio("data_over_noise_outside", data, noise, baselines.outside),
+    }
 
 
-def _masked_mean(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Return the mean over the marked delays of each baseline; zero where none is marked."""
-    return np.sum(values, axis=1, where=mask) / np.maximum(mask.sum(axis=1), 1)
+def _ratio(name: str, above: np.ndarray, below: np.ndarray, mask: np.ndarray) -> dict[str, Statistic]:
+    """Return the ratio of rms amplitudes at the marked delays, of powers (Nbls, Ndelays), if any baseline has any."""
+    used = mask.any(axis=1)
+    if not used.any():
+        return {}
+    means = [(np.sum(values, axis=1, where=mask) / np.maximum(mask.sum(axis=1), 1))[used] for values in (above, below)]
+    return {name: Statistic.of(np.sqrt(means[0] / means[1]), "baselines")}
 
 
 def as_json(statistics: Mapping[str, Statistic]) -> dict[str, Any]:
@@ -323,13 +320,9 @@ def _fractions(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
 class Covered:
     """Fractions of the deviations from the true gains, pooled over all realizations of the noise.
 
-    Attributes
-    ----------
-    expected : fractions of a normal distribution, (Nexpected,)
-    observed, error : of amplitudes and of phases: mean over realizations, and its standard error, (2, Nexpected)
-    within, within_error : the same within 1 and 1.96 errors, (2, 2)
-    worst : of the antenna that is farthest from what is expected, (2, 2)
-    realizations : number of realizations
+    Those of amplitudes and of phases, and the standard errors of these means, (2, Nexpected), belong to `expected` ones
+    of a normal distribution, (Nexpected,), and to those within 1 and 1.96 errors, (2, 2). `worst` are the latter of the
+    antenna that is farthest from what is expected.
     """
 
     expected: np.ndarray

@@ -28,7 +28,7 @@ from calstudy.base.visibilities import polarization_names, positions
 from calstudy.calibrate.agreement import LIMITS, TAPER, aligned_gains
 from calstudy.calibrate.basis import ChannelGrid
 from calstudy.calibrate.degeneracy import fix_phase
-from calstudy.calibrate.gain_errors import determined_spans
+from calstudy.calibrate.gain_errors import determined_spans, within
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.delay import channel_width, delay_transform, delays
 
@@ -49,18 +49,11 @@ FEWEST_REALIZATIONS = 10
 class GainPair:
     """Gains of the same antennas, integrations and channels from two sources; zero where either has none.
 
-    Attributes
-    ----------
-    antennas : names, (Nants,)
-    positions : east and north, m, (Nants, 2)
-    frequency : channel centres, Hz, (Nfreqs,)
-    polarization : name of the feed
-    first, second : complex, (Ntimes, Nants, Nfreqs), of the convention "divide"
-    errors
-        Of the real and the imaginary part of ln (first / second), (2, Ntimes, Nants, Nfreqs), NaN where there is none;
-        None if they are not known.
-    smooth_delay : largest delay, s, of sequences in frequency that are no part of the errors
-    degrees_of_freedom : of the squares of the errors; infinite if they are exact
+    Antennas have names, (Nants,), and positions east and north, m, (Nants, 2); channel centres are in Hz, (Nfreqs,).
+    Gains are complex, (Ntimes, Nants, Nfreqs), of the convention "divide". Errors are of the real and the imaginary
+    part of ln (first / second), (2, Ntimes, Nants, Nfreqs), NaN where there is none; None if they are not known.
+    Sequences in frequency up to `smooth_delay`, s, are no part of them. The degrees of freedom of their squares are
+    infinite if they are exact.
     """
 
     antennas: np.ndarray
@@ -78,15 +71,11 @@ class GainPair:
 class GainDifference:
     """The difference of two sets of gains: rms of the difference over the rms of the second.
 
-    Attributes
-    ----------
-    pair : the gains, the first aligned with the second
-    as_given : difference before the alignment, of all antennas together
-    of_antenna, of_channel : (Nants,) and (Nfreqs,); NaN where there are no gains
-    delay, of_delay : s, ascending, and the ratio of the Blackman-Harris tapered transforms, (Ndelays,)
-    pulls
-        Deviations of amplitudes and phases over their errors, (2, Ntimes, Nants, Nfreqs), NaN where there are none;
-        None if errors are not known.
+    The first gains of the pair are aligned with the second; `as_given` is the difference before that, of all antennas
+    together. Differences of antennas, (Nants,), and channels, (Nfreqs,), are NaN where there are no gains; `of_delay`
+    is the ratio of the Blackman-Harris tapered transforms at ascending delays, s, (Ndelays,). `pulls` are the
+    deviations of amplitudes and phases over their errors, (2, Ntimes, Nants, Nfreqs), NaN where there are none; None if
+    errors are not known.
     """
 
     pair: GainPair
@@ -154,11 +143,9 @@ def pair_gains(
     used = known[0] & known[1][closest]
     combined = None
     if errors is not None:
-        parts = [
-            _relative_errors(cal, of, numbers, feeds[polarization])
-            for cal, of in zip((first, second), errors, strict=True)
-        ]
-        combined = np.where(used, np.hypot(parts[0], parts[1][:, closest]), np.nan)
+        pairs = zip((first, second), errors, strict=True)
+        of_first, of_second = (_relative_errors(*pair, numbers, feeds[polarization]) for pair in pairs)
+        combined = np.where(used, np.hypot(of_first, of_second[:, closest]), np.nan)
     telescope = first.telescope
     rows = positions(telescope.antenna_numbers, numbers)
     return GainPair(
@@ -227,12 +214,12 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         raise InputError("all gains that the two files have in common are flagged in either")
     first = pair.first
     if redundant:
-        both = zip(_without_turns(pair).first, pair.second, strict=True)
+        both = zip(_without_turns(pair), pair.second, strict=True)
         first = np.stack([_without_gradients(*gains, pair.positions) for gains in both])
     solved = first.any(axis=(1, 2))
     aligned = np.zeros_like(first)
     aligned[solved] = aligned_gains(first[solved], pair.second[solved])
-    difference = aligned - pair.second
+    difference, pair_aligned = aligned - pair.second, replace(pair, first=aligned)
     grid = _even_grid(pair.frequency)
     frequencies = np.linspace(pair.frequency[0], pair.frequency[-1], grid.n_channels)
     power = [
@@ -240,13 +227,13 @@ def compare_gains(pair: GainPair, redundant: bool = False) -> GainDifference:
         for values in (difference, pair.second)
     ]
     return GainDifference(
-        pair=replace(pair, first=aligned),
+        pair=pair_aligned,
         as_given=float(_relative(pair.first - pair.second, pair.second, (0, 1, 2))),
         of_antenna=_relative(difference, pair.second, (0, 2)),
         of_channel=_relative(difference, pair.second, (0, 1)),
         delay=delays(grid.n_channels, channel_width(frequencies)),
         of_delay=np.sqrt(power[0] / power[1]),
-        pulls=None if pair.errors is None else _pulls(replace(pair, first=aligned), pair.errors),
+        pulls=None if pair.errors is None else _pulls(pair_aligned, pair.errors),
     )
 
 
@@ -279,7 +266,7 @@ def _pulls(pair: GainPair, errors: np.ndarray) -> np.ndarray | None:
     for at in np.flatnonzero(known.any(axis=(1, 2))):
         ratio = np.divide(pair.first[at], pair.second[at], out=np.ones(known[at].shape, complex), where=known[at])
         spans = determined_spans(pair.frequency, pair.smooth_delay, known[at])
-        change = np.stack([span @ (span.T @ row) for span, row in zip(spans, np.log(ratio), strict=True)])
+        change = within(spans, np.log(ratio))
         power = np.where(known[at], np.abs(pair.second[at]) ** 2, 0)
         total = power.sum(axis=0)
         scale = np.sum(power * change.real) / total.sum()
@@ -294,8 +281,8 @@ def _relative(difference: np.ndarray, gains: np.ndarray, axes: tuple[int, ...]) 
     return np.sqrt(np.divide(above, below, out=np.full(np.shape(above), np.nan), where=below > 0))
 
 
-def _without_turns(pair: GainPair) -> GainPair:
-    """Remove the phase gradient between two sets of gains from the first, for any number of turns across the array.
+def _without_turns(pair: GainPair) -> np.ndarray:
+    """Return the first gains without the phase gradient to the second, for any number of turns across the array.
 
     Gains g_a' = g_a exp(i q x_a) turn the products of antennas of one redundant group all by q d: the mean of those
     products gives q d for the shortest group, and for the shortest that is not parallel to it. On a lattice these are
@@ -303,32 +290,28 @@ def _without_turns(pair: GainPair) -> GainPair:
     """
     first, second = np.triu_indices(len(pair.antennas), 1)
     if not first.size:
-        return pair
+        return pair.first
     vectors = pair.positions[second] - pair.positions[first]
     groups = redundant_groups(np.column_stack([vectors, np.zeros(len(vectors))]), REDUNDANT)
     overlap = pair.first * pair.second.conj()
     products = overlap[:, second] * overlap[:, first].conj()
     products[:, groups.conjugated] = products[:, groups.conjugated].conj()
     vectors = np.where(groups.conjugated[:, None], -vectors, vectors)
-    steps, turns = [], []
-    for group in _spanning([vectors[groups.index == number].mean(axis=0) for number in range(groups.index.max() + 1)]):
-        members = groups.index == group
-        steps.append(vectors[members].mean(axis=0))
-        turns.append(np.angle(products[:, members].sum(axis=1)))
-    gradients = np.einsum("ij,jtf->tif", np.linalg.pinv(np.array(steps)), np.array(turns))
+    means = np.array([vectors[groups.index == number].mean(axis=0) for number in range(groups.index.max() + 1)])
+    chosen = _spanning(means)
+    turns = np.array([np.angle(products[:, groups.index == group].sum(axis=1)) for group in chosen])
+    gradients = np.einsum("ij,jtf->tif", np.linalg.pinv(means[chosen]), turns)
     phases = np.einsum("ai,tif->taf", pair.positions - pair.positions.mean(axis=0), gradients)
-    return replace(pair, first=pair.first * np.exp(-1j * phases))
+    return pair.first * np.exp(-1j * phases)
 
 
-def _spanning(vectors: list[np.ndarray]) -> list[int]:
+def _spanning(vectors: np.ndarray) -> list[int]:
     """Return the indices of the shortest vector, and of the shortest that is not parallel to it if there is one."""
-    order = np.argsort([np.linalg.norm(vector) for vector in vectors])
-    shortest = vectors[order[0]] / np.linalg.norm(vectors[order[0]])
-    for place in order[1:]:
-        across = shortest[0] * vectors[place][1] - shortest[1] * vectors[place][0]
-        if abs(across) > NOT_PARALLEL * np.linalg.norm(vectors[place]):
-            return [int(order[0]), int(place)]
-    return [int(order[0])]
+    lengths = np.array([np.linalg.norm(vector) for vector in vectors])
+    order = np.argsort(lengths)
+    east, north = vectors[order[0]] / lengths[order[0]]
+    across = np.abs(east * vectors[:, 1] - north * vectors[:, 0]) > NOT_PARALLEL * lengths
+    return [int(order[0]), *order[across[order]][:1].tolist()]
 
 
 def _without_gradients(first: np.ndarray, second: np.ndarray, positions: np.ndarray) -> np.ndarray:

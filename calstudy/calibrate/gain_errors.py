@@ -42,7 +42,7 @@ hardly changes while the sky turns by less than a fringe, and which `ErrorsInTim
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -50,8 +50,8 @@ import numpy as np
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.calibrate.basis import gain_vectors
-from calstudy.calibrate.gain_variances import Alignment, as_a_whole, by_antenna, by_channel, pair
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
+from calstudy.calibrate.gain_variances import Alignment, as_a_whole, by_antenna, by_channel
+from calstudy.calibrate.problem import CalibrationProblem, gain_products
 from calstudy.calibrate.tangent_space import SPAN_CUTOFF, TangentSpace
 
 ORDERS = 3
@@ -85,20 +85,13 @@ class Absorption(NamedTuple):
 class GainErrors:
     """Standard deviations of the gains of one solve by noise; NaN for antennas without data in a channel.
 
-    Attributes
-    ----------
-    amplitude : of |g|, in the unit of the gains, (Nants, Nfreqs)
-    phase : of the phase of g, (Nants, Nfreqs)
-    noise_from : whether the variance of the noise is that of the weights, or from the residual of this solve
-    degrees : degrees of freedom of the residual; None where they do not enter
-    left_out : names of the directions that are no part of the errors
-    smooth_delay : largest delay of ``smooth`` directions; zero if there are none
-    smooth_fraction : fraction of the numbers in the gains that are ``smooth``
-    unevenness : mean over median of the residual's power in channels: about one for noise, more for interference
-    determined : function that takes these directions out of a relative change of the gains, complex, (Nants, Nfreqs)
-    absorbed : what foregrounds absorb
-    signal_to_noise : of |g| of each antenna for given foregrounds, the median over channels, (Nants,)
-    noise_alone : what noise alone makes of it, (Nants,)
+    `amplitude` is that of |g| and `phase` that of the phase, (Nants, Nfreqs). `degrees` of freedom of the residual are
+    None where they do not enter. Directions that are `left_out` are no part of the errors; `determined` takes them out
+    of a relative change of the gains, complex, (Nants, Nfreqs). `smooth_delay` is the largest delay of ``smooth`` ones,
+    zero if there are none, and `smooth_fraction` their part of the numbers in the gains. `unevenness` is the mean over
+    the median of the residual's power in channels: about one for noise, more for interference. `signal_to_noise` is
+    that of |g| of each antenna for given foregrounds, the median over channels, and `noise_alone` what noise alone
+    makes of it, (Nants,).
     """
 
     amplitude: np.ndarray = field(metadata={"unit": ""})
@@ -174,11 +167,10 @@ def gain_errors(
     variances = known = by_channel(tangent, structure.antennas, alignment)
     if absorbed is not None:
         variances = known * absorbed.variances
+    elif not problem.frozen and unknowns <= MOST_UNKNOWNS:
+        variances = as_a_whole(tangent, structure.antennas, alignment, spans)
     elif not problem.frozen:
-        if unknowns <= MOST_UNKNOWNS:
-            variances = as_a_whole(tangent, structure.antennas, alignment, spans)
-        else:
-            variances = by_antenna(tangent, structure.antennas, alignment, spans, known)
+        variances = by_antenna(tangent, structure.antennas, alignment, spans, known)
     fitted = gain_products(gains, structure.antennas) * model
     residual = problem.visibilities - fitted
     powers = np.sum(problem.weights * np.abs(residual) ** 2, axis=0)
@@ -186,8 +178,8 @@ def gain_errors(
     sigma = np.where(has_data, np.sqrt(variances * (0.5 if tangent.finite else loss / degrees)), np.nan)
 
     def determined(change: np.ndarray) -> np.ndarray:
-        kept = np.stack([span @ (span.T @ row) for span, row in zip(spans, change, strict=True)])
-        real, imaginary = alignment.align(pair(kept))
+        kept = within(spans, change)
+        real, imaginary = alignment.align(np.stack([kept.real, kept.imag]))
         return real + 1j * imaginary
 
     return GainErrors(
@@ -228,14 +220,6 @@ def _signal_to_noise(
     return found[0], found[1]
 
 
-class _Last(NamedTuple):
-    structure: FitStructure
-    weights: np.ndarray
-    deviations: tuple[float, float]
-    time: float
-    absorbed: Absorption
-
-
 class ErrorsInTime:
     """Errors of solves of one polarization, in the order of time; see `gain_errors`.
 
@@ -245,7 +229,7 @@ class ErrorsInTime:
     def __init__(self, frequencies: np.ndarray, longest: float) -> None:
         self._frequencies = frequencies
         self._fringe = SPEED_OF_LIGHT / (frequencies.max() * longest) / (2 * np.pi * TURNS_PER_DAY)
-        self._last: _Last | None = None
+        self._last: tuple[CalibrationProblem, float, Absorption] | None = None
 
     def of(
         self, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, time: float, settled: bool = True
@@ -257,22 +241,27 @@ class ErrorsInTime:
         absorbed = self._known(problem, time)
         found = gain_errors(problem, gains, model, self._frequencies, absorbed)
         if absorbed is None and settled and isinstance(found, GainErrors):
-            self._last = _Last(problem.structure, problem.weights, problem.deviations, time, found.absorbed)
+            self._last = problem, time, found.absorbed
         return found
 
     def _known(self, problem: CalibrationProblem, time: float) -> Absorption | None:
         """Return the last absorption if it is of the same samples and prior, and within a fringe; else None."""
-        last = self._last
-        if last is None or not 0 <= time - last.time < self._fringe or problem.structure != last.structure:
+        if self._last is None:
             return None
-        if not np.array_equal(problem.weights > 0, last.weights > 0):
+        last, before, absorbed = self._last
+        near = 0 <= time - before < self._fringe and problem.structure == last.structure
+        if not near or not np.array_equal(problem.weights > 0, last.weights > 0):
             return None
         # A finite prior is weighed against the noise.
-        if problem.structure.prior != "none":
-            levels = [np.mean(weights) for weights in (problem.weights, last.weights)]
-            if not np.allclose([*problem.deviations, levels[0]], [*last.deviations, levels[1]], SIMILAR, atol=0):
-                return None
-        return last.absorbed
+        levels = [[*one.deviations, np.mean(one.weights)] for one in (problem, last)]
+        if problem.structure.prior != "none" and not np.allclose(levels[0], levels[1], SIMILAR, atol=0):
+            return None
+        return absorbed
+
+
+def within(spans: Sequence[np.ndarray], change: np.ndarray) -> np.ndarray:
+    """Return what a change of the gains, (Nants, Nfreqs), has within a span of each antenna, (Nfreqs, N)."""
+    return np.stack([span @ (span.T @ row) for span, row in zip(spans, change, strict=True)])
 
 
 def determined_spans(frequencies: np.ndarray, delay: float, has_data: np.ndarray) -> list[np.ndarray]:
@@ -286,9 +275,7 @@ def determined_spans(frequencies: np.ndarray, delay: float, has_data: np.ndarray
         channels = np.flatnonzero(has_data.any(axis=0))
         smooth = gain_vectors(frequencies, delay, slice(int(channels[0]), int(channels[-1]) + 1))
     known: dict[bytes, np.ndarray] = {}
-    for used in has_data:
-        if used.tobytes() in known:
-            continue
+    for used in np.unique(has_data, axis=0):
         span = np.eye(len(used))[:, used]
         if smooth is not None and used.any():
             left, singular, _ = np.linalg.svd(smooth[used])

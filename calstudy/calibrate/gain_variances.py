@@ -214,8 +214,3 @@ def _pulled(tangent: TangentSpace, antennas: np.ndarray, members: np.ndarray, se
             before = parts[place]
             parts[place] = turned if before is None else before + turned
     return [Absorbed(antenna, *parts) for antenna, parts in found.items()]
-
-
-def pair(values: np.ndarray) -> np.ndarray:
-    """Return real and imaginary parts, (2, ...)."""
-    return np.stack([values.real, values.imag])
