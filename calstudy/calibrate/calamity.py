@@ -16,7 +16,7 @@ from calstudy.calibrate.degeneracy import sky_model_slope
 from calstudy.calibrate.deviation import LEAST, PASSES, Estimate, estimate
 from calstudy.calibrate.interface import Assumed, Calibration, Progress
 from calstudy.calibrate.preparation import PreparedFit, make_problem, prepare
-from calstudy.calibrate.problem import CalibrationProblem, FitStructure, repeat_structure, weight_change
+from calstudy.calibrate.problem import CalibrationProblem, weight_change
 from calstudy.calibrate.records import Solve
 from calstudy.calibrate.settings import (
     RUNAWAY,
@@ -50,9 +50,8 @@ def make_solver(settings: GainFit, tolerance: float | None = None) -> Solver:
     solver = settings.solver
     if tolerance is not None:
         solver = solver.model_copy(update={"tolerance": tolerance})
-    if isinstance(solver, GaussNewtonSettings):
-        return GaussNewton(solver.tolerance, solver.max_steps, solver.precision)
-    return Adamax(**solver.model_dump(exclude={"name", "warm_start"}))
+    kind: Callable[..., Solver] = GaussNewton if isinstance(solver, GaussNewtonSettings) else Adamax
+    return kind(**solver.model_dump(exclude={"name", "warm_start"}))
 
 
 def fit(observation: Observation, assumed: Assumed, settings: GainFit, progress: Progress | None = None) -> Calibration:
@@ -61,14 +60,9 @@ def fit(observation: Observation, assumed: Assumed, settings: GainFit, progress:
     Flagged samples have no influence. Autocorrelations are left out, also of the results, unless `settings.autos` is
     set. Raises InputError as for `calstudy.calibrate.preparation.prepare`.
 
-    Parameters
-    ----------
-    observation : visibilities with parallel-hand polarizations only
-    assumed
-        A sky model, whose weighted sum fixes the overall scale, and which is the foreground model if foregrounds are
-        not fitted. Without a sky model the data take its place, which makes gains of about unity. Gains to start from
-        override `settings.initial_gains`.
-    progress : called after each solve with the number done and the total
+    The weighted sum of the assumed sky model fixes the overall scale; it is the foreground model if foregrounds are not
+    fitted. Without a sky model the data take its place, which makes gains of about unity. Assumed gains override
+    `settings.initial_gains`.
     """
     prepared = prepare(observation, settings, assumed)
     shape, used = prepared.data.shape, prepared.used
@@ -83,14 +77,10 @@ def fit(observation: Observation, assumed: Assumed, settings: GainFit, progress:
         for t in range(times.start, times.stop):
             gain_flags[:, :, t, p] = ~prepared.data.antennas_of(prepared.weights[t, :, :, p] > 0)
             gains[:, :, t, p] = np.where(gain_flags[:, :, t, p], 1, solution.gains)
+    # Baselines without weight are not part of the solves.
+    known = model if settings.baselines is None else None
     return Calibration(
-        gains=gains,
-        gain_flags=gain_flags,
-        # Baselines without weight are not part of the solves.
-        model=model if settings.baselines is None else None,
-        flags=~used,
-        baselines=prepared.fitted,
-        outcomes=outcomes,
+        gains=gains, gain_flags=gain_flags, model=known, flags=~used, baselines=prepared.fitted, outcomes=outcomes
     )
 
 
@@ -103,13 +93,14 @@ def _solve_all(
     n_polarizations = prepared.data.n_polarizations
     for p in range(n_polarizations):
         warm: WarmStart | None = None
-        deviations: tuple[float, float] | None = None
+        deviations: Fractions = None
         anew = True
         for index, times in enumerate(groups):
             with Usage() as usage:
                 problem = make_problem(prepared, settings, times, p)
                 if isinstance(problem, str):
-                    solution = _skipped(repeat_structure(prepared.structure, times.stop - times.start), problem)
+                    skipped = Solve("skipped", problem, steps=0, seconds=0.0, cpu_seconds=0.0)
+                    solution = Solution(np.empty(0), np.empty(0), skipped)
                 else:
                     start = warm if settings.solver.warm_start else None
                     if settings.estimates_deviation or isinstance(settings.weights, GainWeights):
@@ -148,12 +139,16 @@ def _solve(
     return again, again_warm, anew
 
 
+Fractions = tuple[float, float] | None
+"""Deviations of the foregrounds, (own, shared), over the rms of the sky model; None if they are fixed."""
+
+
 class _Pass(NamedTuple):
-    """A solve with the fractional deviations of the foregrounds (own, shared) that it used, None if they are fixed."""
+    """A solve, and the deviations that it used."""
 
     solution: Solution
     warm: WarmStart | None
-    deviations: tuple[float, float] | None
+    deviations: Fractions
 
 
 class _Passes:
@@ -174,9 +169,7 @@ class _Passes:
         passes = 1 if self._weights is None else self._weights.passes
         self._most = max(passes, PASSES) if self._estimated else passes
 
-    def solve(
-        self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
-    ) -> _Pass:
+    def solve(self, problem: CalibrationProblem, warm: WarmStart | None, deviations: Fractions) -> _Pass:
         """Solve a problem, whose weights are those of unity gains, and return the last pass.
 
         The first weights are from the gains of the warm start, or of the problem if it is None, and the first
@@ -230,7 +223,7 @@ class _Passes:
         return weight_change(problem.weighted_by(gains).weights, weights) > 1.001 * self._weights.tolerance
 
     def _with_equal_weights(
-        self, problem: CalibrationProblem, warm: WarmStart | None, deviations: tuple[float, float] | None
+        self, problem: CalibrationProblem, warm: WarmStart | None, deviations: Fractions
     ) -> _Pass | None:
         """Solve with the weights of unity gains, and deviations that these solves estimate; None if the solve fails.
 
@@ -241,9 +234,7 @@ class _Passes:
         found = _Passes(settings, self._solver, self._seed).solve(equal, warm, deviations)
         return found if found.solution.record.usable else None
 
-    def _for_pass(
-        self, problem: CalibrationProblem, gains: np.ndarray, deviations: tuple[float, float] | None
-    ) -> CalibrationProblem:
+    def _for_pass(self, problem: CalibrationProblem, gains: np.ndarray, deviations: Fractions) -> CalibrationProblem:
         found = problem if self._weights is None else problem.weighted_by(gains)
         return found if deviations is None else found.with_fractions(deviations)
 
@@ -280,19 +271,10 @@ class _Passes:
 def _together(records: Sequence[Solve]) -> Solve:
     """Return the last record of consecutive solves, with the steps and times of all of them."""
     first, *others = [record.loss_history for record in records]
-    return replace(
-        records[-1],
-        loss_history=np.concatenate([first, *(history[1:] for history in others)]),
-        steps=sum(record.steps or 0 for record in records),
-        seconds=sum(record.seconds or 0 for record in records),
-        cpu_seconds=sum(record.cpu_seconds or 0 for record in records),
-    )
-
-
-def _skipped(structure: FitStructure, message: str) -> Solution:
-    gains = np.ones((structure.n_antennas, structure.n_frequencies), complex)
-    model = np.zeros((structure.n_baselines, structure.n_frequencies), complex)
-    return Solution(gains, model, Solve("skipped", message, steps=0, seconds=0.0, cpu_seconds=0.0))
+    losses = np.concatenate([first, *(history[1:] for history in others)])
+    names = "steps", "seconds", "cpu_seconds"
+    sums: dict[str, Any] = {name: sum(getattr(record, name) or 0 for record in records) for name in names}
+    return replace(records[-1], loss_history=losses, **sums)
 
 
 def _noted(solution: Solution, **diagnostics: Any) -> Solution:

@@ -50,10 +50,9 @@ ADAMAX_STEP = 4e-3
 
 @dataclass(frozen=True)
 class Dimensions:
-    """Quantities that determine the memory of a solve.
+    """Quantities that determine the memory of a solve, counted over all integrations that are solved together.
 
-    Antennas, baselines, models and channels are counted over all integrations that are solved together; `widest` is the
-    number of vectors of the largest foreground basis, `coefficients` that of all models together.
+    `widest` is the number of vectors of the largest foreground basis, `coefficients` that of all models together.
     """
 
     antennas: int
@@ -67,15 +66,8 @@ class Dimensions:
     def of(cls, structure: FitStructure) -> Dimensions:
         """Return the dimensions of a fit structure."""
         basis = structure.basis
-        widest = max(bucket.vectors.shape[-1] for bucket in basis.buckets)
-        return cls(
-            structure.n_antennas,
-            structure.n_baselines,
-            basis.n_models,
-            structure.n_frequencies,
-            widest,
-            basis.n_coefficients,
-        )
+        counts = structure.n_antennas, structure.n_baselines, basis.n_models, structure.n_frequencies
+        return cls(*counts, max(bucket.vectors.shape[-1] for bucket in basis.buckets), basis.n_coefficients)
 
     @property
     def samples(self) -> int:
@@ -89,10 +81,7 @@ class Dimensions:
 
 
 def solve_memory(dimensions: Dimensions, settings: GainFit) -> float:
-    """Return the peak memory of one solve in bytes, libraries included, within about a factor of 1.5.
-
-    `dimensions` are those of all integrations that are solved together.
-    """
+    """Return the peak memory of one solve in bytes, libraries included, within about a factor of 1.5."""
     d = dimensions
     # The problem's complex visibilities and weights, and the solver's pairs of them.
     data = (2 + 1) * 2 * DOUBLE * d.samples

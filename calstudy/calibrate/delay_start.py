@@ -113,8 +113,9 @@ class _DelayFit:
         delays *= self._delay_step
         if model is None:
             delays[found] -= _sky_gradient(delays[found], self.positions[found])
-            return np.exp(delays[:, None] * self._turns)
         phasors = np.exp(delays[:, None] * self._turns)
+        if model is None:
+            return phasors
         first, second = self.antennas.T
         correlation = np.sum(spectra * phasors[first].conj() * phasors[second], axis=1, keepdims=True)
         power = np.sum(weights * np.abs(model) ** 2, axis=1, keepdims=True)
@@ -180,15 +181,9 @@ def _clipped(visibilities: np.ndarray) -> np.ndarray:
 class _DelaySearch:
     """Delays of antennas on a periodic grid, with the greatest sum of scores at the differences tau_a - tau_b.
 
-    Parameters
-    ----------
-    scores : of every baseline at every delay, of mean zero, (Nbls, Ndelays)
-    antennas : the two of each baseline, (Nbls, 2)
-
-    Attributes
-    ----------
-    delays : in steps of the grid, (Nants,), integer; zero until they are found
-    evidence : sum of the largest scores of the baselines of each antenna, (Nants,); zero where there are no data
+    Scores are those of every baseline at every delay, of mean zero, (Nbls, Ndelays). `delays` are in steps of the grid,
+    (Nants,), zero until they are found. `evidence` is the sum of the largest scores of the baselines of each antenna,
+    (Nants,); zero where there are no data.
     """
 
     def __init__(self, scores: np.ndarray, antennas: np.ndarray, n_antennas: int) -> None:
@@ -285,14 +280,12 @@ def _sky_gradient(delays: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 def _offsets(scores: np.ndarray, antennas: np.ndarray, delays: np.ndarray) -> np.ndarray:
     """Return the offset of each delay from its step, (Nants,): the maximum of the sum of parabolas through scores."""
-    n_delays, n_antennas = scores.shape[1], delays.size
     at = (delays[antennas[:, 0]] - delays[antennas[:, 1]])[:, None] + np.array([-1, 0, 1])
-    below, middle, above = np.take_along_axis(scores, at % n_delays, axis=1).T.astype(float)
+    below, middle, above = np.take_along_axis(scores, at % scores.shape[1], axis=1).T.astype(float)
     curvature, slope = np.maximum(2 * middle - below - above, 0), (above - below) / 2
     slope = np.where(curvature > 0, slope, 0)
-    incidence = np.zeros((n_antennas, len(antennas)))
-    columns = np.arange(len(antennas))
-    incidence[antennas[:, 0], columns], incidence[antennas[:, 1], columns] = 1, -1
+    first, second = (np.equal.outer(np.arange(delays.size), column).astype(float) for column in antennas.T)
+    incidence = first - second
     offsets = np.linalg.lstsq((incidence * curvature) @ incidence.T, incidence @ slope, rcond=1e-6)[0]
     return np.clip(offsets, -1, 1)
 

@@ -77,14 +77,10 @@ class DelayModes:
 
 @dataclass(frozen=True)
 class ExpectedTransfer:
-    """The fraction of a white signal's power that a fit preserves.
+    """The fraction of a white signal's power that a fit preserves, at ascending delays, s, (Ndelays,).
 
-    Attributes
-    ----------
-    delay : ascending, s, (Ndelays,)
-    transfer : T, (Nbls, Ndelays); NaN for baselines without data
-    error : standard deviation of the stochastic estimate, of the same shape; zero if it is exact
-    foregrounds, gains : fractions that these absorb, of the same shape; the three fractions add up to one
+    `transfer` is T, (Nbls, Ndelays), NaN for baselines without data, and `error` its standard deviation, zero if it is
+    exact. T and the fractions that foregrounds and gains absorb add up to one.
     """
 
     delay: np.ndarray = field(metadata={"unit": "s"})

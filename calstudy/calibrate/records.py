@@ -85,24 +85,20 @@ class Solve:
 
     def summary(self) -> dict[str, Any]:
         """Return all fields as plain JSON types."""
-        losses = self.loss_history
+        losses = [json_number(loss) for loss in self.loss_history]
         return {
-            "integration": self.integration,
-            "n_integrations": self.n_integrations,
-            "time": self.time,
-            "polarization": self.polarization,
+            **{name: getattr(self, name) for name in ("integration", "n_integrations", "time", "polarization")},
             "status": self.status,
             "message": self.message,
             "n_steps": self.steps,
-            "first_loss": json_number(losses[0]) if losses.size else None,
-            "last_loss": json_number(losses[-1]) if losses.size else None,
+            "first_loss": losses[0] if losses else None,
+            "last_loss": losses[-1] if losses else None,
             "seconds": self.seconds,
             "cpu_seconds": self.cpu_seconds,
-            "newton_decrement": json_number(self.newton_decrement),
-            "decrement_rms": json_number(self.decrement_rms),
+            **{name: json_number(getattr(self, name)) for name in NOT_FINITE},
             "peak_memory": self.peak_memory,
             **({"diagnostics": dict(self.diagnostics)} if self.diagnostics else {}),
-            "loss_history": [json_number(loss) for loss in losses],
+            "loss_history": losses,
         }
 
     @classmethod
@@ -119,15 +115,11 @@ class Solve:
 class CalibrationResult:
     """The result of `calstudy.calibrate.execution.run_calibrator`.
 
-    Attributes
-    ----------
-    gains
-        Gains g of each antenna, channel and integration, gain convention ``divide``: V = g_a g_b* m. Flagged where
-        an antenna has no data in a channel of an integration, even if it shares its gain with others, and where a solve
-        was skipped or failed; unity there.
-    model : the intrinsic foregrounds F, in the unit of the data, times the closure factors c_ab if there are any
-    residual : R = V / (c_ab g_a g_b*) - F, zero where flagged
-    solutions : one record per solve, polarization by polarization, each in the order of time
+    Gains g have the convention ``divide``: V = g_a g_b* m. They are flagged where an antenna has no data in a channel
+    of an integration, even if it shares its gain with others, and where a solve was skipped or failed; unity there. The
+    model is the intrinsic foregrounds F, in the unit of the data, times the closure factors c_ab if there are any. The
+    residual is R = V / (c_ab g_a g_b*) - F, zero where flagged. There is one record per solve, polarization by
+    polarization, each in the order of time.
     """
 
     gains: UVCal

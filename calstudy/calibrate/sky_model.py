@@ -19,15 +19,11 @@ if TYPE_CHECKING:
 def read_sky_model(path: Path, template: UVData) -> UVData:
     """Read visibilities, in Jy, and return them with the metadata of an observation, at its samples.
 
+    The file has any format of visibilities that pyuvdata reads. Antennas are matched by number; their positions may
+    differ from those of the template, the metadata of the observation: rectangular, time-major, a drift scan.
+
     Raises InputError if the file cannot be read or takes data from other files, lacks baselines, integrations, channels
     or polarizations of the observation, or has flagged samples or values that are not finite among them.
-
-    Parameters
-    ----------
-    path
-        A file in any format of visibilities that pyuvdata reads, in Jy. Antennas are matched by number; their positions
-        may differ from those of the template.
-    template : metadata of the observation: rectangular, time-major, a drift scan
     """
     from pyuvdata import UVData
 

@@ -19,12 +19,8 @@ SOURCES = 150
 class Case:
     """Size and noise of a synthetic problem.
 
-    Attributes
-    ----------
-    extent : diameter of a random array, m
-    first, band : centre of the first channel, and number of channels times their width, Hz; by default the paper's
-    gain_scatter, noise, eor : scatter of the gains per channel; noise and EoR over the rms of the foregrounds
-    integration : time between integrations, s
+    A random array has the diameter `extent`, m. The first channel and the band, by default the paper's, are in Hz, and
+    the time between integrations is in s. Noise and EoR are over the rms of the foregrounds.
     """
 
     antennas: int = 36
