@@ -219,16 +219,6 @@ class GainResponse:
         damping = kernels.scalar(kernels.dampings.least)
         self._equations = NormalEquations(projection, reduced.gains, damping, inverse)
 
-    def solve(self, change: np.ndarray) -> np.ndarray:
-        """Return the relative change eta of the gains, complex, (Nants, Nfreqs), for a change y of the whitened data.
-
-        `change` is J_g* y, in the unit of the square root of the loss, complex, (Nants, Nfreqs).
-        """
-        # Inside the kernels the loss has the weighted square of the data for a unit.
-        descent = pairs.to_pair(change / self._unit, self._kernels.dtype)
-        eta, _ = self._kernels.solve_graph(self._equations, descent, self._tolerance, CG_ITERATIONS)
-        return pairs.to_complex(eta)
-
     def left_of(self, difference: np.ndarray) -> np.ndarray:
         """Return the rest of a difference of calibrated data after a fit of gains and foregrounds, times D.
 
@@ -246,8 +236,11 @@ class GainResponse:
         descent = np.zeros(self._shape, complex)
         np.add.at(descent, first, gradient)
         np.add.at(descent, second, gradient.conj())
-        eta = self.solve(descent)
-        return eta[first] + eta[second].conj()
+        # Inside the kernels the loss has the weighted square of the data for a unit.
+        right_side = pairs.to_pair(descent / self._unit, self._kernels.dtype)
+        eta, _ = self._kernels.solve_graph(self._equations, right_side, self._tolerance, CG_ITERATIONS)
+        change = pairs.to_complex(eta)
+        return change[first] + change[second].conj()
 
     def absorbed(self, tangent: TangentSpace, left: np.ndarray) -> np.ndarray:
         """Return the part of W y that gains absorb, less the foregrounds' response to it, (Nbls, Nfreqs)."""

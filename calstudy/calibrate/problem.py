@@ -149,14 +149,9 @@ class CalibrationProblem:
         object.__setattr__(self, name, values)
 
     @property
-    def frozen_model(self) -> np.ndarray | None:
-        """The sky model if the foregrounds are frozen to it, (Nbls, Nfreqs); None if they are fitted."""
-        return self.sky_model if self.frozen else None
-
-    @property
-    def prior_mean(self) -> np.ndarray | None:
-        """The mean of the foregrounds' finite prior, (Nbls, Nfreqs); None if there is no such prior."""
-        return None if self.structure.prior == "none" else self.sky_model
+    def mean(self) -> np.ndarray | None:
+        """The sky model if the foregrounds are frozen to it, or have a finite prior about it; None if they are free."""
+        return self.sky_model if self.frozen or self.structure.prior != "none" else None
 
     def weighted_by(self, gains: np.ndarray) -> CalibrationProblem:
         """Divide the weights by |g_a g_b|^2 of gains (Nants, Nfreqs), and keep their sum."""

@@ -242,8 +242,8 @@ class JointKernels:
         start = pairs.to_pair(gains, tf.float64)
         coefficients: tuple[tf.Tensor, ...] = ()
         model, target, summed = None, 0j, ()
-        if (frozen := problem.frozen_model) is not None:
-            model = self.tensors.load_model(frozen, exact.scale, self.dtype)
+        if (known := problem.mean) is not None:
+            model = self.tensors.load_model(known, exact.scale, self.dtype)
         else:
             best = self.projector.project(start, exact.visibilities, exact.weights).model
             coefficients = self.loss.coefficients(self.tensors.of_models(tf.concat(best, axis=1)))

@@ -207,12 +207,11 @@ class ReducedKernels:
         data = self.tensors.load(problem, tf.float64)
         total = float(tf.reduce_sum(data.weights))
         arrays: tuple[tf.Tensor, ...] = (data.visibilities, data.weights / total)
-        if (model := problem.frozen_model) is not None:
-            arrays += (self.tensors.load_model(model, data.scale, tf.float64),)
-        if (mean := problem.prior_mean) is not None:
+        if (mean := problem.mean) is not None:
+            arrays += (self.tensors.load_model(mean, data.scale, tf.float64),)
+        if self.structure.prior != "none":
             # Coefficients of unit variance stay so if the loss is divided by its unit and the weights by their sum.
-            deviations = math.sqrt(total) * np.array(problem.deviations)
-            arrays += (self.tensors.load_model(mean, data.scale, tf.float64), tf.constant(deviations, tf.float64))
+            arrays += (tf.constant(math.sqrt(total) * np.array(problem.deviations), tf.float64),)
         start = self.exact_space.expand(self.exact_space.reduce(pairs.to_pair(gains, tf.float64)))
         return ReducedData(start, arrays, data.scale, total * data.scale**2)
 
