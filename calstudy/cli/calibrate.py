@@ -43,10 +43,8 @@ Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format tha
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
 Gains = Annotated[Path | None, typer.Option(help="File of gains to start from; by default unity.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="YAML file: a `calibration` section.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default) or adamax.")]
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
 Redundant = Annotated[bool, typer.Option("--redundant", help="One foreground model per redundant group.")]
-GainsOnly = Annotated[bool, typer.Option("--gains-only", help="Freeze the sky model and solve for gains alone.")]
 Weighting = Annotated[str | None, typer.Option(help="gains (default), flags, nsamples, autos, or a UVFlag file.")]
 Select = Annotated[
     list[str] | None,
@@ -93,10 +91,8 @@ def calibrate(
     sky_model: SkyModel = None,
     gains: Gains = None,
     settings_file: SettingsFile = None,
-    solver: SolverName = None,
     buffer: Buffer = None,
     redundant: Redundant = False,
-    gains_only: GainsOnly = False,
     weights: Weighting = None,
     select: Select = None,
     interference: FlagInterference = False,
@@ -123,9 +119,8 @@ def calibrate(
     from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
 
     changes = {
-        "solver": solver,
         "basis.buffer": buffer,
-        "calibrator": _calibrator(redundant, gains_only),
+        "calibrator": "calamity-redundant" if redundant else None,
         "weights": _weights(weights),
         "initial_gains": None if gains is None else {"kind": "file", "path": str(gains)},
     }
@@ -158,12 +153,6 @@ def calibrate(
             return
         solution = study.run(console)
     sys.exit(_show(solution, output, console))
-
-
-def _calibrator(redundant: bool, gains_only: bool) -> str | None:
-    if redundant and gains_only:
-        raise InputError("--redundant and --gains-only: choose one; a frozen sky model has no groups")
-    return "calamity-redundant" if redundant else "sky-based" if gains_only else None
 
 
 def _weights(text: str | None) -> Any:
