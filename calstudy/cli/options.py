@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -65,8 +66,14 @@ SECTIONS = {
 
 
 @contextmanager
-def named_as_options(renamed: Callable[[str], str]) -> Iterator[None]:
-    """Rename the fields of files in errors to the options of a command; equal sentences are said once."""
+def named_as_options(*names: tuple[str, str]) -> Iterator[None]:
+    """Replace patterns, of fields of files, in errors by the options of a command; equal sentences are said once."""
+
+    def renamed(text: str) -> str:
+        for field, option in names:
+            text = re.sub(field, option, text)
+        return text
+
     try:
         yield
     except ExperimentError as error:
