@@ -86,15 +86,8 @@ class Sections(TyperGroup):
     """A group of commands whose help lists them by section."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands by section, and those of no section last."""
-        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        # A whole sentence, in as many lines as it has, not cut off at the end of the first.
-        texts = {
-            name: found.get_short_help_str(limit=1000) for name, found in commands.items() if found and not found.hidden
-        }
-        listed = {name for names in SECTIONS.values() for name in names}
-        others = tuple(name for name in texts if name not in listed)
-        for title, names in {**SECTIONS, "Others": others}.items():
-            if rows := [(name, texts[name]) for name in names if name in texts]:
-                with formatter.section(title):
-                    formatter.write_dl(rows, col_max=16)
+        """Write the commands by section, each with its first sentence in as many lines as it has."""
+        for title, names in SECTIONS.items():
+            with formatter.section(title):
+                texts = [(name, self.commands[name].get_short_help_str(limit=1000)) for name in names]
+                formatter.write_dl(texts, col_max=16)

@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, Validati
 from rich.console import Console
 
 from calstudy import __version__
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.files import digest_json, sha256
 from calstudy.base.identity import identity
 from calstudy.base.schema import Section
@@ -131,8 +131,14 @@ def scoring_of(experiment: Experiment) -> str:
 
 def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:
     """Return the scores of all cases of a comparison, from `load_worlds`, and make products that are missing."""
-    for label in {study.name, *(label for case in study.cases for label in (case.world, case.calibrator))}:
-        _require_label(label)
+    for label in (study.name, *study.file.worlds, *study.file.calibrators):
+        try:
+            TypeAdapter(Label).validate_python(label)
+        except ValidationError:
+            raise InputError(
+                f"{label!r}: cannot label a row of scores; use at most 80 letters, digits, spaces and "
+                ". , : ; ( ) + - % = '"
+            ) from None
     study, count = study.sized_to(budget)
     runs, tasks = folder_of_runs(study.outputs), list(study.scores.values())
     with log_to(runs / LOG):
@@ -151,15 +157,6 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
     return Scores(calstudy=__version__, name=study.name, rows=tuple(rows), refusals=tuple(study.refused))
 
 
-def _require_label(label: str) -> None:
-    try:
-        TypeAdapter(Label).validate_python(label)
-    except ValidationError:
-        raise InputError(
-            f"{label!r}: cannot label a row of scores; use at most 80 letters, digits, spaces and . , : ; ( ) + - % = '"
-        ) from None
-
-
 def tables(scores: Scores) -> dict[str, Table]:
     """Return a table for each world, as in the comparison of calibrators, and one of which calibrators pass."""
     worlds = dict.fromkeys([*(row.world for row in scores.rows), *(world for world, _, _ in scores.refusals)])
@@ -171,9 +168,8 @@ def tables(scores: Scores) -> dict[str, Table]:
 def read_scores(path: Path) -> Scores:
     """Read a file of scores; raises InputError if it is not one."""
     try:
-        return Scores.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        with errors_of_files(f"{path}: cannot be read"):
+            return Scores.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise InputError(f"{path}: is not a file of 'calstudy score --output' ({_first(error)})") from None
 

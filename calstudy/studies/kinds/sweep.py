@@ -55,11 +55,7 @@ class Sweep(Family):
 
     @classmethod
     def of(cls, experiment: Experiment, folder: Path = Path()) -> Sweep:
-        """Return the family of an experiment with a `sweep`, whose relative paths of files start at a folder.
-
-        Raises ExperimentError with one sentence per fault: a field that cannot be varied, is unknown, or does not take
-        a value, a point whose fields do not go together, or points of a block that are the same.
-        """
+        """Return the family of an experiment with a `sweep`; raises ExperimentError with one sentence per fault."""
         if not experiment.sweep:
             raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
         faults = _faults(experiment)
