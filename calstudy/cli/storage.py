@@ -32,12 +32,7 @@ def runs(folder: RunsFolder = Path("runs")) -> None:
     from calstudy.results.reader import find_runs
 
     rows = [
-        (
-            run.path.relative_to(folder).as_posix(),
-            run.finished.strftime("%Y-%m-%d %H:%M"),
-            _size(run.size),
-            f"{len(run.keys)}",
-        )
+        (f"{run.path.relative_to(folder)}", f"{run.finished:%Y-%m-%d %H:%M}", _size(run.size), f"{len(run.keys)}")
         for run in find_runs(folder)
     ]
     Table(("folder", "finished (UTC)", "size", "products"), rows, f"runs in {folder}").show(Console(highlight=False))

@@ -353,10 +353,9 @@ class Comparison(Family):
 
 @dataclass(frozen=True)
 class WorldData:
-    """The tasks of the exported products of one experiment, which calibrates data with the EoR and without.
+    """The tasks of the exported products of one experiment; the salt of a blind challenge may be empty.
 
-    Data sets are in the order of their digests, which does not reveal their content. The salt of a blind challenge may
-    be empty.
+    Data sets are in the order of their digests, which does not reveal their content.
     """
 
     experiment: Experiment
