@@ -18,12 +18,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, wraps
-from html import escape
 from io import StringIO
 from numbers import Integral
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin, get_type_hints
+
+from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.gains import draw_gains, read_gain_errors
@@ -62,7 +63,6 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
     from pyuvdata import UVCal, UVData
-    from rich.console import Console
 
     from calstudy.experiment.model import Experiment, Folders, Variant
     from calstudy.power.transfer import TransferFunction
@@ -95,16 +95,9 @@ def _typed(function: Callable[P, R]) -> Callable[P, R]:
 def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
     """Load a study; raises InputError if the file cannot be read, or a field is unknown or has a wrong value.
 
-    Parameters
-    ----------
-    source
-        A YAML file, the name of a published experiment, such as "quickstart", or the content of a file, whose relative
-        paths start at the working directory.
-    scale
-        Name of a set of overrides in the file's `scales`.
-    **changes
-        Fields that are changed, by dotted path: ``**{"instrument.times.count": 8}``. Values are those that the file
-        could have: numbers, texts with units, lists and mappings.
+    The source is a YAML file, the name of a published experiment, or the content of a file, whose relative paths start
+    at the working directory. The scale is one of the file's `scales`. Fields are changed by dotted path, to values that
+    the file could have: ``**{"instrument.times.count": 8}``.
     """
     texts = _overrides(changes)
     if isinstance(source, Mapping):
@@ -130,29 +123,12 @@ def calibrate_data(
 ) -> CalibratedData:
     """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
 
-    Raises InputError if the data cannot be used, a field is unknown or has a value that is not allowed, or the folder
-    has results.
-
-    Parameters
-    ----------
-    data
-        Files in any format that pyuvdata reads.
-    output
-        Folder for the results.
-    observed
-        Fields of the section `observed` of a study of measured data: `select`, `sky_model`, `flag_interference`.
-    overwrite
-        Whether results of an earlier calibration may be replaced.
-    quiet
-        If true, no progress is printed.
-    gain_errors
-        Whether gains get their errors by noise, as without ``--no-gain-errors``. A number is that of
-        ``--gain-error-realizations``, for calibrators whose gains have no errors of their own.
-    **changes
-        Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
+    Data are files in any format that pyuvdata reads. `observed` has fields of that section of a study of measured data:
+    `select`, `sky_model`, `flag_interference`. A number as `gain_errors` is that of ``--gain-error-realizations``, for
+    calibrators whose gains have no errors of their own. All other arguments are fields of the section `calibration` by
+    dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``. Raises InputError if the data cannot be
+    used, a field is unknown or has a value that is not allowed, or the folder has results.
     """
-    from rich.console import Console
-
     paths = [data] if isinstance(data, str | Path) else data
     section = {"data": [str(path) for path in paths], **(observed or {})}
     sections = {"observed": section, "gain_errors": gain_errors if isinstance(gain_errors, bool) else int(gain_errors)}
@@ -187,8 +163,8 @@ class CalibratedData:
     def draw_gains(self, seed: int) -> UVCal:
         """Return the gains with a draw of their errors, for errors of baselines that were not fitted.
 
-        The noise of fitted baselines is not independent of that of their gains, and needs no draws. Raises InputError
-        if the calibration has no errors, or smooth gains: draws are independent by channel, and such errors are not.
+        The noise of fitted baselines is not independent of that of their gains. Raises InputError if the calibration
+        has no errors, or smooth gains: draws are independent by channel.
         """
         if smoothed := [name for name in SMOOTHING if self.solution["settings"].get(name) is not None]:
             raise InputError(
@@ -234,7 +210,9 @@ class StudyPlan(dict[str, Any]):
         return pandas.DataFrame(self["stages"]).set_index("stage")
 
     def __repr__(self) -> str:
-        return _printed(lambda console: show_plan(self, console))
+        text = StringIO()
+        show_plan(self, Console(width=120, highlight=False, file=text))
+        return text.getvalue().rstrip()
 
 
 class LoadedStudy:
@@ -266,8 +244,7 @@ class LoadedStudy:
     def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
         """Return the stages of a run with the estimated time, memory and disk.
 
-        By default there is a worker process for each core, as far as the memory allows. `max_memory` is that of all
-        workers together, such as "6 GB"; by default all free memory.
+        By default there is a worker process for each core; all share `max_memory`, such as "6 GB", or all that is free.
         """
         return StudyPlan(describe_plan(self._study, Budget(workers, max_memory)))
 
@@ -278,12 +255,10 @@ class LoadedStudy:
         scheduler: str | None = None,
         quiet: bool = False,
     ) -> OpenRun:
-        """Make all products that are not in the store, and fill the run folder; if `quiet`, without printed progress.
+        """Make all products that are not in the store, and fill the run folder; parameters as for `plan`.
 
-        Workers and memory are as for `plan`; `scheduler` is the address of a running dask scheduler in place of them.
+        `scheduler` is the address of a running dask scheduler in place of workers.
         """
-        from rich.console import Console
-
         finished = run_study(self._study, Budget(workers, max_memory, scheduler), Console(quiet=quiet))
         return open_run(finished.folder)
 
@@ -316,9 +291,6 @@ class ByVariant(Mapping[str, Any]):
     def __len__(self) -> int:
         return len(self._names)
 
-    def _ipython_key_completions_(self) -> list[str]:
-        return self._names
-
     def __repr__(self) -> str:
         return f"variants: {', '.join(self._names)}"
 
@@ -342,12 +314,12 @@ class OpenRun:
     @property
     def spectra(self) -> ByVariant:
         """Spherical power spectra outside the wedge, by variant: datasets with `power` and errors against `k`."""
-        return self._by_variant(self._spherical("outside-wedge"))
+        return self._spherical("outside-wedge")
 
     @property
     def spectra_of_all_modes(self) -> ByVariant:
         """Spherical power spectra of all modes, by variant."""
-        return self._by_variant(self._spherical("all-modes"))
+        return self._spherical("all-modes")
 
     @property
     def cylindrical(self) -> ByVariant:
@@ -381,8 +353,7 @@ class OpenRun:
         """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
 
         Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
-        limit in all worlds in units of the EoR, and `transfer`, the smallest T, of the linear response where that is
-        lower by more than the error of T.
+        limit in units of the EoR, and `transfer`, the smallest T (`calstudy.verdicts.standing`).
         """
         import pandas
 
@@ -391,18 +362,12 @@ class OpenRun:
         if not limit > 0:
             raise InputError(f"limit = {limit!r}: must be greater than 0, in units of the power of the EoR")
         found = self._folder.standings(limit, worlds)
-        rows = [
-            (
-                *entry.band,
-                entry.calibrator,
-                entry.standing,
-                [world.world for world in entry.decisive],
-                entry.upper_limit,
-                entry.transfer,
-            )
-            for entry in found
-        ]
         columns = ["k_from", "k_to", "calibrator", "standing", "worlds", "bias_below", "transfer"]
+        worlds_of = [[world.world for world in entry.decisive] for entry in found]
+        rows = [
+            (*entry.band, entry.calibrator, entry.standing, decisive, entry.upper_limit, entry.transfer)
+            for entry, decisive in zip(found, worlds_of, strict=True)
+        ]
         return pandas.DataFrame(rows, columns=columns).set_index(columns[:3])
 
     @property
@@ -448,22 +413,19 @@ class OpenRun:
         """Return the gains of a calibrated variant, of one of the two noise realizations, or the "true" gains."""
         from pyuvdata import UVCal
 
-        study = self._experiment
-        task = corruption.gains(study.graph) if variant == "true" else self._calibration(variant, half)
-        return UVCal.from_file(self._product(task, study) / GAINS)
+        is_true = variant == "true"
+        task = corruption.gains(self._experiment.graph) if is_true else self._calibration(variant, half)
+        return UVCal.from_file(self._product(task) / GAINS)
 
     def gain_errors(self, variant: str = "residual", half: Half = "even") -> xarray.Dataset:
         """Compute standard deviations of gains by noise, `amplitude` and `phase`, from the products in the store.
 
-        Variant and half are as for `gains`. Raises InputError, with the reason, if the errors are not known for the
-        calibrator or the size of the array.
+        Raises InputError, with the reason, if they are not known for the calibrator or the size of the array.
         """
         self._calibration(variant, half)
-        study = self._experiment
-        task = errors_of_gains(study.graph, self._variant(variant), half)
-        task = task.given({name: self._product(needed, study) for name, needed in task.needs.items()})
+        task = errors_of_gains(self._experiment.graph, self._variant(variant), half)
         with TemporaryDirectory() as folder:
-            task.make(Path(folder))
+            task.given(self._inputs(task)).make(Path(folder))
             reasons = {record.get("reason") for record in read_json(Path(folder) / ERRORS)["records"]}
             if None not in reasons:
                 raise InputError(f"{variant}: no errors of gains: {'; '.join(sorted(reasons))}")
@@ -474,11 +436,10 @@ class OpenRun:
 
         These are the residual if the variant is calibrated, else the simulated data.
         """
-        study = self._experiment
         if self._variant(variant).calibrate:
-            return read_visibilities(self._product(self._calibration(variant, half), study) / RESIDUAL)
-        data = corruption.data(study.graph, self._variant(variant), _half(half))
-        return read_visibilities(self._product(data, study) / DATA)
+            return read_visibilities(self._product(self._calibration(variant, half)) / RESIDUAL)
+        data = corruption.data(self._experiment.graph, self._variant(variant), _half(half))
+        return read_visibilities(self._product(data) / DATA)
 
     @property
     def figures(self) -> list[str]:
@@ -487,17 +448,15 @@ class OpenRun:
 
     def plot(self, name: str) -> Figure:
         """Draw a figure of the study again from the products in the store; raises InputError if they are not there."""
-        study = self._study
-        tasks = {task.label: task for task in study.figures}
+        tasks = {task.label: task for task in self._study.figures}
         if name not in tasks:
             raise InputError(
                 f"{name!r}: no figure of this study{nearest(name, list(tasks))}; it has {', '.join(tasks)}"
             )
         task = cast(Draw, tasks[name])
-        inputs = {needed: self._product(other, study) for needed, other in task.needs.items()}
         # Some figures also write tables, which are in the folder of the run already.
         with TemporaryDirectory() as folder:
-            return task.given(inputs).drawing(Path(folder)).figure
+            return task.given(self._inputs(task)).drawing(Path(folder)).figure
 
     def __repr__(self) -> str:
         numbers = ", ".join(f"{number.name} {number.text}" for number in read_headline(self._folder))
@@ -505,9 +464,6 @@ class OpenRun:
         lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
         setup = [self._folder.manifest["setup"]] if "setup" in self._folder.manifest else []
         return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{escape(repr(self))}</pre>"
 
     @cached_property
     def _study(self) -> Study:
@@ -528,15 +484,12 @@ class OpenRun:
 
     def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
         if not (names := self._folder.tables.variants):
-            raise InputError(f"{self.name}: has no spectra by variant; {self._remedy}")
+            remedy = "take one of its parts" if self.parts else "run the experiment again"
+            raise InputError(f"{self.name}: has no spectra by variant; {remedy}")
         return ByVariant(names, read)
 
-    @property
-    def _remedy(self) -> str:
-        return "take one of its parts" if self.parts else "run the experiment again"
-
-    def _spherical(self, modes: str) -> Callable[[str], xarray.Dataset]:
-        return lambda name: by_wavenumber(self._folder.tables.spherical(name, modes))
+    def _spherical(self, modes: str) -> ByVariant:
+        return self._by_variant(lambda name: by_wavenumber(self._folder.tables.spherical(name, modes)))
 
     def _by_region(self, read: Callable[[str], TransferFunction]) -> xarray.Dataset:
         import xarray
@@ -555,8 +508,11 @@ class OpenRun:
             raise InputError(f"{variant!r} is not calibrated")
         return calibration.calibration(self._experiment.graph, self._variant(variant), _half(half))
 
-    def _product(self, task: Task, study: Study) -> Path:
-        stores = self._stores(study.outputs)
+    def _inputs(self, task: Task) -> dict[str, Path]:
+        return {name: self._product(needed) for name, needed in task.needs.items()}
+
+    def _product(self, task: Task) -> Path:
+        stores = self._stores(self._study.outputs)
         # Keys of today differ if code or a file that the run used was changed since.
         name = (task.stage.name, task.label)
         keys = [entry["key"] for entry in self._folder.products if (entry["stage"], entry["label"]) == name]
@@ -607,7 +563,6 @@ def _plain(value: Any, path: str = "") -> Any:
 
 
 def _half(half: str) -> str:
-    """Return the name of a half of the data; raises InputError if it is none."""
     if half not in PARITIES:
         raise InputError(f"half = {half!r}: must be one of {', '.join(PARITIES)}")
     return half
@@ -618,11 +573,3 @@ def _single(study: Study) -> ExperimentStudy:
         remedy = "take one of its parts" if study.parts else "its numbers are in its tables and scores"
         raise InputError(f"{study.name}: has several experiments; {remedy}")
     return study
-
-
-def _printed(show: Callable[[Console], None]) -> str:
-    from rich.console import Console
-
-    text = StringIO()
-    show(Console(width=120, highlight=False, file=text))
-    return text.getvalue().rstrip()

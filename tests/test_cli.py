@@ -8,12 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 from command_line import run_and_read, run_command
 from tiny import of_the_paper, tiny
 
 from calstudy.calibrate.settings import BasisSettings
 from calstudy.cli import main as cli
+from calstudy.cli.options import SECTIONS
 from calstudy.experiment.files import override, validate
 from calstudy.experiment.model import FIGURES
 from calstudy.instrument.as_built import AsBuilt
@@ -40,6 +42,11 @@ def here(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
     return tmp_path
+
+
+def test_every_command_is_in_a_section_of_the_help():
+    listed = [name for names in SECTIONS.values() for name in names]
+    assert sorted(listed) == sorted(typer.main.get_command(cli.app).commands)
 
 
 def plan_of(capsys, file: str) -> str:
@@ -139,7 +146,6 @@ def test_all_faults_of_a_file_are_told_on_standard_error(here, capsys):
             ["plan", "tiny.yaml", "--set", "calibration.basis.buffer=10 us"],
             "calibration.basis: a delay half-width",
         ),
-        (["examples"], "'examples' was a command of earlier versions; use calstudy init --list"),
         (["data", "fetch", "gleem"], "nothing that can be fetched (allowed: gleam, beam, g4jy, haslam)"),
     ],
 )

@@ -19,7 +19,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.package_files import experiment_names, published
 from calstudy.cli import main as cli
 from calstudy.experiment.files import dump, override, parse_yaml, validate
-from calstudy.run.store import Lease, Product, Store
+from calstudy.run.store import Store
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import SCHEMA_FILE, experiment_schema
 
@@ -108,7 +108,6 @@ def test_the_experiment_of_which_can_be_copied_and_changed(here, capsys):
         (["store", "nowhere"], "nowhere: no such store"),
         (["store", "store", "--delete"], "--delete: say which products"),
         (["store", "store", "--older-than", "long"], "--older-than long: write a number of hours or days"),
-        (["store", "store", "--larger-than", "big"], "--larger-than big: write a positive number"),
         (["store", "store", "--unreferenced", "--runs", "nowhere"], "nowhere: no such folder of runs"),
     ],
 )
@@ -234,7 +233,6 @@ def test_nothing_is_deleted_unasked_and_what_runs_were_made_from_is_kept(used_st
     assert "4 products" in output_of(capsys, "store")
     assert "2 products" in output_of(capsys, "store", "--unreferenced")
     assert "2 products" in output_of(capsys, "store", "--older-than", "30d")
-    assert "0 products" in output_of(capsys, "store", "--larger-than", "1 MB")
     assert keys(used_store) == {"a", "b", "c", "d"}
     told = output_of(capsys, "store", "--unreferenced", "--older-than", "30d", "--delete")
     assert re.findall(r"deleted: average \((\w)\)", told) == ["d"]
@@ -270,31 +268,16 @@ def test_exported_data_among_runs_are_no_run(used_store, here, capsys):
     assert "2 products" in output_of(capsys, "store", "--unreferenced")
 
 
-def test_a_store_is_verified_and_what_is_damaged_is_named(used_store, capsys):
-    assert "4 products" in output_of(capsys, "store", "--verify")
-    (used_store.folder("average", key_of("a")) / "data.bin").write_bytes(b"y" * 1000)
-    (used_store.folder("average", key_of("b")) / "product.json").unlink()
-    (used_store.root / "average" / ".building-e-1").mkdir()
-    for deleted in ("damaged", "deleted"):
-        options = ["--delete"] if deleted == "deleted" else []
-        status = cli.app(["store", "--verify", *options], standalone_mode=False)
-        told = capsys.readouterr().out
-        assert status == 1
-        assert re.findall(rf"{deleted}: average (\w)", told) == ["a", "b"]
-    assert keys(used_store) == {"c", "d"}
-    assert "2 products" in output_of(capsys, "store", "--verify")
-
-
 @pytest.mark.parametrize("place", ["average/notes", "my.folder/of.mine", f"average/{key_of('e')}", "mine/product.json"])
 def test_what_is_no_product_is_never_deleted(used_store, capsys, place):
     precious = used_store.root / place / "precious.txt"
     precious.parent.mkdir(parents=True)
     precious.write_text("mine")
-    assert "4 products" in output_of(capsys, "store", "--verify", "--delete")
+    assert "4 products" in output_of(capsys, "store", "--older-than", "0h", "--delete")
     assert precious.read_text() == "mine"
     # Runs, in place of a store.
     (used_store.root.parent / "runs" / "mine-1234" / "figures").mkdir()
-    assert "0 products" in output_of(capsys, "store", "runs", "--verify", "--delete")
+    assert "0 products" in output_of(capsys, "store", "runs", "--older-than", "0h", "--delete")
     assert (used_store.root.parent / "runs" / "mine-1234" / "figures").is_dir()
 
 
@@ -370,34 +353,3 @@ def test_all_channels_and_antennas_are_proposed_where_none_stands_out_or_data_ar
         assert parse_yaml(text, "mine")["observed"]["select"] == {"frequencies": "139.453 MHz..143.262 MHz"}
         (here / "mine.yaml").unlink()
         monkeypatch.setattr("calstudy.cli.start.LARGE", 1.0)
-
-
-def test_what_a_run_removes_while_a_store_is_verified_is_not_damaged(used_store, capsys, monkeypatch):
-    def removed_later(store: Store) -> list[tuple[str, str]]:
-        found = [("average", key_of(name)) for name in "abcd"]
-        store.remove(*found[0])
-        return found
-
-    monkeypatch.setattr(Store, "addresses", removed_later)
-    assert "0 damaged" in output_of(capsys, "store", "--verify")
-
-
-def test_what_is_damaged_and_needed_by_a_run_is_not_deleted(used_store, capsys):
-    (used_store.folder("average", key_of("a")) / "data.bin").write_bytes(b"y" * 1000)
-    with Lease(used_store).holding([key_of("a")]):
-        assert cli.app(["store", "--verify", "--delete"], standalone_mode=False) == 1
-    assert f"kept, for a run needs it: average {key_of('a')}" in capsys.readouterr().out
-    assert keys(used_store) == {"a", "b", "c", "d"}
-
-
-def test_what_a_run_made_again_while_a_store_is_verified_is_not_deleted(used_store, capsys, monkeypatch):
-    look, looked = Store.verify, []
-
-    def damaged_at_first(store: Store, stage: str, key: str) -> Product | None:
-        looked.append(key)
-        return None if looked == [key_of("a")] else look(store, stage, key)
-
-    monkeypatch.setattr(Store, "verify", damaged_at_first)
-    assert cli.app(["store", "--verify", "--delete"], standalone_mode=False) == 1
-    assert f"no longer damaged: average {key_of('a')}" in capsys.readouterr().out
-    assert keys(used_store) == {"a", "b", "c", "d"}

@@ -7,7 +7,6 @@ import re
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,10 +42,8 @@ Data = Annotated[list[Path], typer.Argument(help="Visibilities in any format tha
 SkyModel = Annotated[Path | None, typer.Option("--sky-model", help="Visibilities that fix the overall scale.")]
 Gains = Annotated[Path | None, typer.Option(help="File of gains to start from; by default unity.")]
 SettingsFile = Annotated[Path | None, typer.Option("--settings", help="YAML file: a `calibration` section.")]
-SolverName = Annotated[str | None, typer.Option("--solver", help="gauss-newton (default) or adamax.")]
 Buffer = Annotated[str | None, typer.Option(help="Added to the horizon delay of the foreground model: '100 ns'.")]
 Redundant = Annotated[bool, typer.Option("--redundant", help="One foreground model per redundant group.")]
-GainsOnly = Annotated[bool, typer.Option("--gains-only", help="Freeze the sky model and solve for gains alone.")]
 Weighting = Annotated[str | None, typer.Option(help="gains (default), flags, nsamples, autos, or a UVFlag file.")]
 Select = Annotated[
     list[str] | None,
@@ -93,10 +90,8 @@ def calibrate(
     sky_model: SkyModel = None,
     gains: Gains = None,
     settings_file: SettingsFile = None,
-    solver: SolverName = None,
     buffer: Buffer = None,
     redundant: Redundant = False,
-    gains_only: GainsOnly = False,
     weights: Weighting = None,
     select: Select = None,
     interference: FlagInterference = False,
@@ -120,12 +115,11 @@ def calibrate(
     from calstudy.products.files import quiet_libraries
     from calstudy.realdata.selection import split_selections
     from calstudy.run.execution import Budget
-    from calstudy.studies.calibration import DataCalibration, calibration_file, require_free
+    from calstudy.studies.calibration import UNFINISHED, DataCalibration, calibration_file, require_free
 
     changes = {
-        "solver": solver,
         "basis.buffer": buffer,
-        "calibrator": _calibrator(redundant, gains_only),
+        "calibrator": "calamity-redundant" if redundant else None,
         "weights": _weights(weights),
         "initial_gains": None if gains is None else {"kind": "file", "path": str(gains)},
     }
@@ -148,7 +142,9 @@ def calibrate(
     # They may use the path of the field in an experiment file.
     texts = [f"calibration.{text.strip().removeprefix('calibration.')}" for text in overrides or []]
     console = Console(soft_wrap=True, highlight=False)
-    with named_as_options(partial(_in_options, output)), quiet_libraries():
+    store = re.escape(f"outputs.store = {str((output / UNFINISHED).resolve())!r}")
+    named = f"--output {output}".replace("\\", r"\\")
+    with named_as_options(*OPTIONS, (store, named)), quiet_libraries():
         require_free(output, overwrite)
         study = DataCalibration.load(calibration_file(sections, output, texts))
         study, _ = study.sized_to(Budget(workers=1, max_memory=max_memory))
@@ -160,12 +156,6 @@ def calibrate(
     sys.exit(_show(solution, output, console))
 
 
-def _calibrator(redundant: bool, gains_only: bool) -> str | None:
-    if redundant and gains_only:
-        raise InputError("--redundant and --gains-only: choose one; a frozen sky model has no groups")
-    return "calamity-redundant" if redundant else "sky-based" if gains_only else None
-
-
 def _weights(text: str | None) -> Any:
     if text is None or text in ("gains", "flags", "nsamples", "autos"):
         return text
@@ -175,10 +165,9 @@ def _weights(text: str | None) -> Any:
 
 
 def _calibration(path: Path | None, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the section `calibration` of a YAML file, which has it or is it, with changes by dotted path.
+    """Return the section `calibration` of a YAML file, which has it or is it, with changes, but for None, by path.
 
-    A change to None is none. The path of a calibrator in the file starts at the file, all others at the working
-    directory.
+    The path of a calibrator in the file starts at the file, all others at the working directory.
     """
     from calstudy.calibrate.interface import CALIBRATORS
     from calstudy.experiment.files import override, read_mapping
@@ -201,22 +190,12 @@ def _calibration(path: Path | None, changes: Mapping[str, Any]) -> dict[str, Any
     return content
 
 
-def _in_options(output: Path, text: str) -> str:
-    """Name the options in place of the fields of files."""
-    from calstudy.studies.calibration import UNFINISHED
-
-    for field, option in OPTIONS:
-        text = re.sub(field, option, text)
-    return text.replace(f"outputs.store = {str((output / UNFINISHED).resolve())!r}", f"--output {output}")
-
-
 def _show(solution: Mapping[str, Any], output: Path, console: Console) -> int:
     """Print changes of the data, warnings and what is known of the solves; return the exit status."""
     records = solution["records"]
     lines = [*solution["notes"], *(f"warning: {text}" for text in solution["warnings"])]
     lines.append(f"results are in {output}")
-    left = [record for record in records if record["newton_decrement"] is not None]
-    if left:
+    if left := [record for record in records if record["newton_decrement"] is not None]:
         worst = max(left, key=lambda record: record["newton_decrement"])
         lines.append(
             f"left by stopping: at most {100 * worst['newton_decrement']:.2g} % of the residual's power "
@@ -230,8 +209,7 @@ def _show(solution: Mapping[str, Any], output: Path, console: Console) -> int:
         for reason in sorted(set(reasons))
         if not any(reason in warning for warning in solution["warnings"])
     ]
-    for line in lines:
-        console.print(line, markup=False)
+    console.print("\n".join(lines), markup=False)
     return _status(records)
 
 
@@ -239,9 +217,8 @@ def _about_the_sky_model(diagnostics: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return sentences on the data against the sky model, of what solves say of it."""
     lines = []
     if known := [found for found in diagnostics if "sky_model_slope" in found]:
-        slope, shape = (
-            statistics.median(found[name] for found in known) for name in ("sky_model_slope", "band_shape_rms")
-        )
+        slope = statistics.median(found["sky_model_slope"] for found in known)
+        shape = statistics.median(found["band_shape_rms"] for found in known)
         lines.append(
             f"calibrated data over the sky model: {slope:.4f}, and {100 * shape:.2g} % rms from channel to channel"
         )
@@ -260,15 +237,14 @@ def _status(records: Sequence[Mapping[str, Any]]) -> int:
     unconverged = [record for record in records if record["status"] not in SETTLED]
     if not unconverged:
         return 0
-    typer.echo(f"calstudy: {len(unconverged)} of {len(records)} solves did not converge:", err=True)
+    lines = [f"{len(unconverged)} of {len(records)} solves did not converge:"]
     for record in unconverged[:NAMED]:
-        typer.echo(
-            f"calstudy: integration {record['integration']}, polarization "
-            f"{polarization_names([record['polarization']])}: {record['status']}, {record['message']}",
-            err=True,
-        )
-    if len(unconverged) > NAMED:
-        typer.echo(f"calstudy: and {len(unconverged) - NAMED} more, see solution.json", err=True)
+        polarization = polarization_names([record["polarization"]])
+        where = f"integration {record['integration']}, polarization {polarization}"
+        lines.append(f"{where}: {record['status']}, {record['message']}")
+    lines += [f"and {len(unconverged) - NAMED} more, see solution.json"] if len(unconverged) > NAMED else []
+    for line in lines:
+        typer.echo(f"calstudy: {line}", err=True)
     return EXIT_UNCONVERGED
 
 
@@ -340,15 +316,12 @@ def _errors_of_both(first: Path, second: Path, other_gains: str) -> tuple[Errors
     from calstudy.calibrate.gain_comparison import obstacle
 
     one, other = find_gain_errors(first), find_gain_errors(second)
-    if one is None and other is None:
-        return None
     if one is None or other is None:
         reason: str | None = f"{first if one is None else second} has none"
-    else:
-        reason = other_gains or obstacle(one, other)
-        if not reason:
-            return one, other
-    typer.echo(f"calstudy: errors of gains are not compared: {reason}", err=True)
+    elif not (reason := other_gains or obstacle(one, other)):
+        return one, other
+    if one is not None or other is not None:
+        typer.echo(f"calstudy: errors of gains are not compared: {reason}", err=True)
     return None
 
 
@@ -359,15 +332,12 @@ def _in_units_of_errors(found: GainDifference) -> dict[str, float | str]:
     if found.pulls is None:
         return {}
     delay = found.pair.smooth_delay
-    expected = _percentages(found.expected_within)
-    numbers: dict[str, float | str] = {
-        "gains that are compared with their errors": f"beyond {1e9 * delay:.0f} ns" if delay > 0 else "all"
-    }
+    compared = f"beyond {1e9 * delay:.0f} ns" if delay > 0 else "all"
+    numbers: dict[str, float | str] = {"gains that are compared with their errors": compared}
+    noise = f"({_percentages(found.expected_within)} % if independent noise makes all of it)"
     for name, chi_squared, within in zip(PARTS, found.chi_squared, found.within, strict=True):
         numbers[f"chi-squared per {name}"] = chi_squared
-        numbers[f"{name}s within 1 and 1.96 errors"] = (
-            f"{_percentages(within)} % ({expected} % if independent noise makes all of it)"
-        )
+        numbers[f"{name}s within 1 and 1.96 errors"] = f"{_percentages(within)} % {noise}"
     return numbers
 
 
@@ -407,13 +377,11 @@ def _draw(found: GainDifference) -> Figure:
     by_antenna.plot(place, found.of_antenna, "o", color=style.BLUE)
     if place.size <= MOST_NAMES:
         by_antenna.set_xticks(place, found.pair.antennas, rotation=90, fontsize=style.NOTE_SIZE)
-    by_antenna.set_xlabel("antenna")
     by_antenna.set_ylabel("rms difference / rms")
     by_channel.plot(found.pair.frequency / 1e6, found.of_channel, color=style.BLUE)
-    by_channel.set_xlabel(style.FREQUENCY)
     by_delay.plot(1e9 * found.delay, found.of_delay, color=style.BLUE)
-    by_delay.set_xlabel(style.DELAY)
-    for axes in (by_antenna, by_channel, by_delay):
+    for axes, label in ((by_antenna, "antenna"), (by_channel, style.FREQUENCY), (by_delay, style.DELAY)):
+        axes.set_xlabel(label)
         if np.nanmax(axes.lines[0].get_ydata()) > 0:
             axes.set_yscale("log")
     by_channel.set_title(f"feed {found.pair.polarization}; together {found.together:.3g}")

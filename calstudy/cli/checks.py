@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.cli.options import AsJson, MaxMemory, Runs, Scheduler, Set, Workers, with_runs
+from calstudy.cli.options import MaxMemory, Runs, Scheduler, Set, Workers, with_runs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 EXIT_MOVED = 1
+"""Exit status if a number is beyond its tolerance, or a step fails."""
 
 Folders = Annotated[
     list[Path] | None,
@@ -65,19 +66,19 @@ def regress(
     references = find_references(folders or ([] if against else [reference_folder()]))
     if against is not None and len(references) != 1:
         raise InputError("--against RUN: give the one reference folder that the run is to be compared with")
-    references = references if len(references) == 1 else _with_results(references, console)
+    references = _with_results(references, console)
     budget = Budget(workers, max_memory, scheduler)
-    made, holds = {}, []
+    made, hold = {}, True
     for reference in references:
         run = against or _made_again(reference, overrides or (), budget, console, alone=len(references) == 1)
-        holds.append(run is not None and (_compare(reference, run, update, console) or update))
         if run is not None:
             made[reference] = run
+            hold &= _compare(reference, run, update, console) or update
     # After all runs, because their manifests would otherwise record a changed checkout.
     for reference, run in made.items() if update else ():
         accept(run, reference)
         console.print(f"{reference}: updated", markup=False)
-    _leave(bool(made), all(holds))
+    _leave(bool(made), hold and len(made) == len(references))
 
 
 def _leave(any_made: bool, all_hold: bool) -> None:
@@ -89,19 +90,17 @@ def _leave(any_made: bool, all_hold: bool) -> None:
 
 
 def _with_results(references: list[Path], console: Console) -> list[Path]:
-    """Leave out studies without results of their own, such as sweeps, and name them."""
+    """Leave out, of several studies, those without results of their own, such as sweeps, and name them."""
     from calstudy.regression import has_results
 
-    found = []
-    for reference in references:
+    found = list(references)
+    for reference in references if len(references) > 1 else ():
         # A study that cannot be read is named in its turn.
         with suppress(InputError):
             if not has_results(reference):
-                console.print(
-                    f"{reference}: left out, for its study has no results of its own to compare", markup=False
-                )
-                continue
-        found.append(reference)
+                found.remove(reference)
+                text = f"{reference}: left out, for its study has no results of its own to compare"
+                console.print(text, markup=False)
     return found
 
 
@@ -138,9 +137,6 @@ def _compare(reference: Path, run: Path, update: bool, console: Console) -> bool
     return found.holds
 
 
-EXIT_FAILED = 1
-
-
 def validate(
     steps: Annotated[
         list[str] | None,
@@ -151,7 +147,6 @@ def validate(
     max_memory: MaxMemory = None,
     output: Runs = None,
     overrides: Set = None,
-    as_json: AsJson = False,
 ) -> None:
     """Run the validation ladder: experiments with limits for numbers; PASS or FAIL, measured value, threshold, why.
 
@@ -160,15 +155,12 @@ def validate(
     from calstudy.experiment.files import StudyFile
     from calstudy.run.execution import Budget
     from calstudy.validation.ladder import Ladder, passed, run_ladder, tally
-    from calstudy.verdicts.tables import show_verdicts, to_json
+    from calstudy.verdicts.tables import show_verdicts
 
     ladder = Ladder.load(StudyFile(Path(), {"steps": steps or ()}, scale, with_runs(overrides, output)))
-    console = Console(soft_wrap=True, highlight=False, stderr=as_json)
+    console = Console(soft_wrap=True, highlight=False)
     folder, verdicts = run_ladder(ladder, Budget(workers, max_memory), console)
-    if as_json:
-        typer.echo(to_json(verdicts))
-    else:
-        show_verdicts(verdicts, ladder.description, Console(highlight=False), "step", tally(verdicts))
-        console.print(f"results: {folder}", markup=False)
+    show_verdicts(verdicts, ladder.description, Console(highlight=False), "step", tally(verdicts))
+    console.print(f"results: {folder}", markup=False)
     if not passed(verdicts):
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(EXIT_MOVED)

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
-from calstudy.cli.options import AsJson, MaxMemory, Overwrite, Scale, Set, StudyFile, Workers
+from calstudy.cli.options import MaxMemory, Overwrite, Scale, Set, StudyFile, Workers
 
 Format = Annotated[str, typer.Option("--format", help="uvh5, uvfits or ms (which takes python-casacore).")]
 Output = Annotated[Path, typer.Option(help="Folder for the data; worlds of a comparison get a folder each in it.")]
@@ -53,8 +53,7 @@ def export(
         worlds = load_worlds(blind, None, (), CARRIER)
     with quiet_libraries():
         folders = write(worlds, output, file_format, overwrite, Budget(workers, max_memory), console)
-    for folder in folders:
-        console.print(f"{folder}", markup=False)
+    console.print(*folders, sep="\n", markup=False)
 
 
 Gains = Annotated[
@@ -80,7 +79,6 @@ def score(
     calibrator: OfClass = None,
     name: Name = None,
     output: ScoreFile = None,
-    as_json: AsJson = False,
     scale: Scale = None,
     overrides: Set = None,
     workers: Workers = None,
@@ -103,16 +101,12 @@ def score(
     console = Console(soft_wrap=True, highlight=False)
     with quiet_libraries():
         worlds = load_worlds(file, scale, overrides or (), blocks)
-        found = measure_scores(worlds, Budget(workers, max_memory), Console(quiet=True) if as_json else console)
+        found = measure_scores(worlds, Budget(workers, max_memory), console)
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    if as_json:
-        typer.echo(found.model_dump_json(indent=1))
-        return
     for world, table in tables(found).items():
-        console.print(f"{world}:", markup=False)
-        console.print(table.markdown(), markup=False)
+        console.print(f"{world}:\n{table.markdown()}", markup=False)
     for world, calibrator, why in found.refusals:
         console.print(f"{calibrator} cannot work in {world}: {why}", markup=False)
 
@@ -132,9 +126,9 @@ def _blocks(folder: Path | None, calibrator: str | None, name: str | None) -> di
     """Return the calibrator to be scored by its label, or None for those of the file."""
     from calstudy.experiment.files import parse_yaml
 
-    if folder is not None and calibrator is not None:
-        raise InputError("--calibrator: cannot be given together with a folder of gains")
     if folder is not None:
+        if calibrator is not None:
+            raise InputError("--calibrator: cannot be given together with a folder of gains")
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder")
         return {name or folder.resolve().name: {"calibrator": "by-file", "folder": str(folder.resolve())}}

@@ -52,18 +52,10 @@ app = typer.Typer(
 )
 data_app = typer.Typer(help="Files that are downloaded once.", no_args_is_help=True)
 app.add_typer(data_app, name="data")
-app.command()(calibrate)
-app.command()(regress)
-app.command()(compare_gains)
-app.command()(export)
-app.command()(score)
-app.command()(leaderboard)
+for command in (calibrate, regress, compare_gains, export, score, leaderboard, init, which, runs, store):
+    app.command()(command)
 # Step -1 is an argument, not an option.
 app.command(context_settings={"ignore_unknown_options": True})(validate)
-app.command()(init)
-app.command()(which)
-app.command()(runs)
-app.command()(store)
 
 EXIT_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -169,7 +161,6 @@ def claims(
     run_code: Annotated[
         bool, typer.Option("--run-code", help="Run Python files that the folder's experiment names.")
     ] = False,
-    as_json: AsJson = False,
 ) -> None:
     """Compare a finished run with published statements: the measured number, its threshold, and the verdict.
 
@@ -184,7 +175,7 @@ def claims(
     """
     from calstudy.claims.evaluation import Evaluation, evaluate_folder
     from calstudy.results.reader import RunFolder
-    from calstudy.verdicts.tables import combined, show_verdicts, to_json
+    from calstudy.verdicts.tables import combined, show_verdicts
 
     console = Console(highlight=False)
     runs = [RunFolder(path) for path in (folder, *(others or ()))]
@@ -196,9 +187,6 @@ def claims(
         evaluated = Evaluation(combined(run.claims for run in runs))
     else:
         evaluated = evaluate_folder(folder, paper or (), run_code)
-    if as_json:
-        typer.echo(to_json(evaluated.verdicts))
-        return
     if evaluated.verdicts:
         show_verdicts(evaluated.verdicts, ", ".join(run.name for run in runs), console)
     for sentence in evaluated.without_role:
@@ -285,9 +273,10 @@ class _Termination:
         raise Terminated("SIGTERM")
 
 
-def _flush() -> None:
+def _end(leave: Callable[[int], NoReturn]) -> NoReturn:
     sys.stdout.flush()
     sys.stderr.flush()
+    leave(EXIT_INPUT)
 
 
 def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
@@ -310,16 +299,14 @@ def main(leave: Callable[[int], NoReturn] = os._exit) -> None:
         for sentence in error.faults if isinstance(error, ExperimentError) else [str(error)]:
             typer.echo(f"calstudy: {sentence}", err=True)
         if isinstance(error, DiskError):
-            _flush()
-            leave(EXIT_INPUT)
+            _end(leave)
         sys.exit(EXIT_INPUT)
     except (OSError, RuntimeError) as error:
         reason, name = refusal_of_disk(error), getattr(error, "filename", None)
         if reason is None:
             raise
         typer.echo(f"calstudy: {name or 'a file'}: cannot be read or written ({reason})", err=True)
-        _flush()
-        leave(EXIT_INPUT)
+        _end(leave)
     except (KeyboardInterrupt, SystemExit) as end:
         # Typer ends an interrupted command with this status and no message.
         if isinstance(end, SystemExit) and end.code != EXIT_INTERRUPTED:

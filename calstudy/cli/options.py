@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -65,8 +66,14 @@ SECTIONS = {
 
 
 @contextmanager
-def named_as_options(renamed: Callable[[str], str]) -> Iterator[None]:
-    """Rename the fields of files in errors to the options of a command; equal sentences are said once."""
+def named_as_options(*names: tuple[str, str]) -> Iterator[None]:
+    """Replace patterns, of fields of files, in errors by the options of a command; equal sentences are said once."""
+
+    def renamed(text: str) -> str:
+        for field, option in names:
+            text = re.sub(field, option, text)
+        return text
+
     try:
         yield
     except ExperimentError as error:
@@ -75,34 +82,12 @@ def named_as_options(renamed: Callable[[str], str]) -> Iterator[None]:
         raise type(error)(renamed(str(error))) from None
 
 
-REMOVED = {
-    "examples": "calstudy init --list",
-    "schema": "calstudy fields --schema FILE",
-    "check": "calstudy run checks, whose figures are the checks",
-    "bench": "the benchmarks of the repository (benchmarks/README.md)",
-}
-"""Commands of earlier versions, and what has taken their place."""
-
-
 class Sections(TyperGroup):
-    """A group of commands whose help lists them by section, and which knows those of earlier versions."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command by its name; one of an earlier version ends with a sentence that names its successor."""
-        if args and args[0] in REMOVED:
-            ctx.fail(f"'{args[0]}' was a command of earlier versions; use {REMOVED[args[0]]}")
-        return super().resolve_command(ctx, args)
+    """A group of commands whose help lists them by section."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands by section, and those of no section last."""
-        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        # A whole sentence, in as many lines as it has, not cut off at the end of the first.
-        texts = {
-            name: found.get_short_help_str(limit=1000) for name, found in commands.items() if found and not found.hidden
-        }
-        listed = {name for names in SECTIONS.values() for name in names}
-        others = tuple(name for name in texts if name not in listed)
-        for title, names in {**SECTIONS, "Others": others}.items():
-            if rows := [(name, texts[name]) for name in names if name in texts]:
-                with formatter.section(title):
-                    formatter.write_dl(rows, col_max=16)
+        """Write the commands by section, each with its first sentence in as many lines as it has."""
+        for title, names in SECTIONS.items():
+            with formatter.section(title):
+                texts = [(name, self.commands[name].get_short_help_str(limit=1000)) for name in names]
+                formatter.write_dl(texts, col_max=16)

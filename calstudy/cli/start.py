@@ -1,7 +1,4 @@
-"""``calstudy init``, and the JSON schema: the first steps of an experiment file.
-
-`starter.yaml` is a small experiment with comments on possible changes, and `observed.yaml` one of measured data.
-"""
+"""``calstudy init``, from `starter.yaml` or `observed.yaml`, and the JSON schema."""
 
 from __future__ import annotations
 
@@ -86,7 +83,7 @@ def _require_usable(beam: str | None, data: str | None) -> None:
     if beam is not None and data is None:
         raise InputError(f"--beam {beam}: is the beam of measured data, which --data names; else set instrument.beam")
     if beam is not None and not beam.startswith("{") and not FILE_REFERENCE.fullmatch(beam):
-        with named_as_options("--beam: {}".format):
+        with named_as_options(("^", "--beam: ")):
             BEAMS.find(beam)
 
 
@@ -96,10 +93,10 @@ def _list_examples() -> None:
     from calstudy.experiment.files import read_mapping
     from calstudy.studies.study import kind_of
 
-    rows = []
+    rows, folder = [], published("experiments")
     for name in experiment_names():
-        content = read_mapping(published("experiments") / f"{name}.yaml")
-        kind = kind_of(content, published("experiments")).__module__.rpartition(".")[2]
+        content = read_mapping(folder / f"{name}.yaml")
+        kind = kind_of(content, folder).__module__.rpartition(".")[2]
         rows.append((name, kind, " ".join(str(content.get("description", "")).split())))
     Table(("name", "kind", "description"), rows, "published experiments").show(Console(highlight=False), numbers=False)
 
@@ -113,11 +110,9 @@ def _described(data: str) -> dict[str, str]:
     from calstudy.realdata.selection import Selection
     from calstudy.realdata.settings import find_data
 
-    try:
+    with named_as_options(("^", "--data: ")):
         paths = (find_data(data, Path()),)
         facts = read_facts(paths, Selection(), even=False)
-    except InputError as error:
-        raise InputError(f"--data: {error}") from None
     if facts.times.size < 2:
         raise InputError(
             f"--data: {data} has 1 integration, and a study needs two, for even and odd: join it with others of the "
@@ -148,29 +143,22 @@ def _proposed(facts: Facts, whole: str, paths: tuple[Path, ...]) -> dict[str, st
     from calstudy.realdata.reading import prepare, read_visibilities
     from calstudy.realdata.selection import antenna_text
 
-    antennas = "# antennas: 0,1,12"
+    proposed = {"band": whole, "antennas": "# antennas: 0,1,12"}
     if facts.size(facts.times.size).samples > LARGE:
-        return {
-            "band": whole,
-            "band_reason": "All channels; data so large were not searched for interference",
-            "antennas": antennas,
-        }
-    try:
-        with quiet_libraries():
-            data, _ = prepare(read_visibilities(paths))
-    except InputError as error:
-        raise InputError(f"--data: {error}") from None
+        return {**proposed, "band_reason": "All channels; data so large were not searched for interference"}
+    with named_as_options(("^", "--data: ")), quiet_libraries():
+        data, _ = prepare(read_visibilities(paths))
     if lost := uncorrelated(data):
         kept = [antenna_text(data, number) for number in facts.frame.numbers.tolist() if number not in lost]
-        antennas = (
+        proposed["antennas"] = (
             f"# All but {', '.join(map(str, lost))}, of whose cross-correlations at most one is above the noise; "
             f"without this line: all.\n    antennas: {','.join(kept)}"
         )
     found = quiet_band(data)
     if found is None:
-        return {"band": whole, "band_reason": "All channels: leave out edges and interference", "antennas": antennas}
+        return {**proposed, "band_reason": "All channels: leave out edges and interference"}
     reason = f"The longest stretch of channels that are not flagged and do not stand out from others; all: {whole}"
-    return {"band": _band(*found), "band_reason": reason, "antennas": antennas}
+    return {**proposed, "band": _band(*found), "band_reason": reason}
 
 
 def _band(first: float, last: float) -> str:
@@ -178,11 +166,7 @@ def _band(first: float, last: float) -> str:
 
 
 def write_schema(path: Path) -> None:
-    """Write the JSON schema of experiment files; raises InputError if it cannot be, or would replace another file.
-
-    An editor with the YAML language server reads it if the first line of a file is
-    `# yaml-language-server: $schema=FILE`; files of `calstudy init` have this line.
-    """
+    """Write the JSON schema of experiment files; raises InputError if it cannot be, or would replace another file."""
     from calstudy.studies.reference import SCHEMA_TITLE, experiment_schema
 
     with errors_of_files(f"--schema {path}: cannot be written"):
@@ -202,8 +186,8 @@ def _copy(example: str, name: str) -> str:
     if "experiments" in content or isinstance(content.get("experiment"), str):
         raise InputError(f"--example {example}: is made of other files; copy one of those")
     lines = path.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if not line.startswith(MODELINE)]
-    return re.sub(r"^name: .*$", f"name: {name}", "\n".join(kept), count=1, flags=re.MULTILINE) + "\n"
+    kept = "\n".join(line for line in lines if not line.startswith(MODELINE))
+    return re.sub(r"^name: .*$", f"name: {name}", kept, count=1, flags=re.MULTILINE) + "\n"
 
 
 def _filled(template: str, **entries: str) -> str:

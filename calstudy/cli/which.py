@@ -20,10 +20,9 @@ FIELDS = (
     (r"^instrument\.location(\.\w+)?(?= =|:)", "--site"),
     (r"^instrument\.beam \(empty\): must be", "--beam: is needed, because none is known for this array and site:"),
     (r"^instrument\.beam(\.path)?(?= =|:)", "--beam"),
+    (r"^((LAYOUT|--site|--beam).*) \(in '[^']*'( and \d+ other cases?)?\)$", r"\1"),
 )
-"""Fields in messages, and the options that set them."""
-CASES = r" \(in '[^']*'( and \d+ other cases?)?\)$"
-"""The end of messages on fields, which names cases; all have the same array."""
+"""Fields in messages, and the options that set them; cases are not named, for all have the same array."""
 
 Layout = Annotated[
     str,
@@ -73,7 +72,7 @@ def which(
 
     changes = [*array_changes(layout, site, beam), *with_runs(overrides, output)]
     console, budget = Console(soft_wrap=True, highlight=False), Budget(workers, max_memory)
-    with named_as_options(_in_options):
+    with named_as_options(*FIELDS):
         # The file is not the user's, and names no others: paths are those of options.
         file = StudyFile.open(published("experiments") / "which.yaml", scale, changes)
         study = study_of(replace(file, base=Path.cwd()))
@@ -84,15 +83,14 @@ def which(
 
 
 def array_changes(layout: str, site: str | None, beam: str | None) -> list[str]:
-    """Return the changes of the experiment, as of --set; the beam is empty if none is known.
-
-    Layout and beam may also be blocks in braces, as in an experiment file.
-    """
+    """Return the changes of the experiment, as of --set; the beam is empty if none is known."""
     from calstudy.instrument.settings import LAYOUTS
 
     changes = {"instrument.layout": _block(layout, "csv", (".csv", ".txt", ".tsv", ".dat"))}
     if site is not None:
-        changes["instrument.location"] = _place(site)
+        place = re.fullmatch(r"\s*([-+\d.]+)\s*,\s*([-+\d.]+)\s*", site)
+        degrees = place and f"{{latitude: {place[1]} deg, longitude: {place[2]} deg}}"
+        changes["instrument.location"] = degrees or site
     if beam is None:
         # The site of a block, or of a user's file, is not known here.
         known = layout in LAYOUTS.names()
@@ -110,16 +108,3 @@ def _block(text: str, kind: str, suffixes: tuple[str, ...]) -> str:
         return json.dumps({"kind": kind, "path": str(Path(text).resolve())})
     is_code = text.endswith(".py") or ".py:" in text
     return json.dumps(str(Path(text).resolve())) if is_code else text
-
-
-def _place(site: str) -> str:
-    """Return latitude and longitude as a block; a name, and what is neither, as it is."""
-    found = re.fullmatch(r"\s*([-+\d.]+)\s*,\s*([-+\d.]+)\s*", site)
-    return f"{{latitude: {found[1]} deg, longitude: {found[2]} deg}}" if found else site
-
-
-def _in_options(sentence: str) -> str:
-    for pattern, replacement in FIELDS:
-        if re.search(pattern, sentence):
-            return re.sub(CASES, "", re.sub(pattern, replacement, sentence))
-    return sentence

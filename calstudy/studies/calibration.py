@@ -106,21 +106,14 @@ File = TypeVar("File", bound=DataFile)
 
 
 def read_file(model: type[File], file: StudyFile) -> File:
-    """Return the content of a file of measured data, with the defaults for such data and absolute paths.
-
-    Raises ExperimentError if fields are unknown, missing or have values that are not allowed, or an input file does not
-    exist.
-    """
+    """Return the content of a file of measured data, with the defaults for such data; errors as for `checked`."""
     content = with_defaults(apply_scale(file.content, file.scale), file.changed(), file.folder)
     changed = replace(file, content=content, scale=None).changed()
     return checked(model, changed, file.folder)
 
 
 def read_selected(file: DataFile, files: tuple[Path, ...], even: bool = True) -> Facts:
-    """Read the metadata of the selected data; raises InputError as `read_facts`, or if the noise is not known.
-
-    `even` requires equally spaced channels.
-    """
+    """Read the metadata of the selected data; raises InputError as `read_facts`, or if the noise is not known."""
     section = file.observed
     try:
         facts = read_facts(files, section.select.selection, section.positions, even)
@@ -156,18 +149,12 @@ class DataStudy(Study):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes of the calibrator on settings that will not work well, and on integrations that are days apart."""
-        gaps = [np.diff(np.sort(facts.times)).max(initial=0.0) for facts in self.data.facts.values()]
-        if max(gaps) < 1:
-            return self.solve_plan.notes
-        note = f"observed.data: integrations are up to {max(gaps):.3g} days apart, and are treated as one run"
-        return (*self.solve_plan.notes, note)
+        gap = max(np.diff(np.sort(facts.times)).max(initial=0.0) for facts in self.data.facts.values())
+        apart = f"observed.data: integrations are up to {gap:.3g} days apart, and are treated as one run"
+        return (*self.solve_plan.notes, *([apart] if gap >= 1 else []))
 
     def sized_to(self, budget: Budget) -> tuple[Self, int]:
-        """Return the study fitted to a budget, and the number of workers.
-
-        Raises InputError if the memory is too small, the calibrator refuses the data, or they are too few for a search
-        for interference.
-        """
+        """Return the study fitted to a budget, and the number of workers; raises InputError for unusable data."""
         if self.file.observed.flag_interference is not None:
             for facts in self.data.facts.values():
                 require_surroundings(facts.times.size, facts.frequencies.size)
@@ -200,12 +187,13 @@ class DataCalibration(DataStudy):
         """Return the calibration of a file, with the metadata of its data."""
         content = read_file(CalibrationFile, file)
         fit = content.calibration
-        if content.expected_loss and not isinstance(fit, GainFit):
-            raise InputError(f"expected_loss: is known for fits by least squares, and {fit.label} is none")
-        if content.expected_loss and isinstance(fit, GainFit) and (field := fit.not_in_expected_loss):
-            raise InputError(
-                f"expected_loss: lacks the effect of calibration.{field} on the residual; leave out one of the two"
-            )
+        if content.expected_loss:
+            if not isinstance(fit, GainFit):
+                raise InputError(f"expected_loss: is known for fits by least squares, and {fit.label} is none")
+            if field := fit.not_in_expected_loss:
+                raise InputError(
+                    f"expected_loss: lacks the effect of calibration.{field} on the residual; leave out one of the two"
+                )
         facts = read_selected(content, content.observed.data, even=False)
         if {"hyperdrive", "mwaocal"} & set(content.also) and set(facts.polarizations) != LINEAR:
             raise InputError(
@@ -253,10 +241,7 @@ class DataCalibration(DataStudy):
         )
 
     def read(self) -> list[str]:
-        """Read all input files without calibrating; return sentences on what is done to the data, and on doubts.
-
-        Raises InputError if a file cannot be used.
-        """
+        """Read all input files; return sentences on what is done to the data, and on doubts; raises InputError."""
         from calstudy.calibrate.preparation import starting_gains
         from calstudy.calibrate.weights import conspicuous, make_weights
 
@@ -300,8 +285,7 @@ class DataCalibration(DataStudy):
     def run(self, console: Console) -> dict[str, Any]:
         """Calibrate, write the results to the folder, and return the content of solution.json.
 
-        The products are kept in a hidden folder until the results are written, so that another run resumes. Raises
-        InputError if a stage refuses its input, or the folder cannot be written or is in use.
+        The products are kept in a hidden folder until the results are written, so that another run resumes.
         """
         store = Store(self.outputs.store)
         store.prepare()
@@ -334,7 +318,12 @@ class DataCalibration(DataStudy):
             if any(record.get("gain_errors", {}).get("lost_antennas") for record in solution["records"]):
                 flag_unsolved(work)
             (work / SOLUTION).write_text(json.dumps(solution, indent=1, allow_nan=False), encoding="utf-8")
-            self._write_gains_also(work)
+            for kind in self.file.also:
+                gains, path = UVCal.from_file(work / GAINS), (work / GAINS).with_suffix(SUFFIXES[kind])
+                if kind == "calfits":
+                    gains.write_calfits(str(path))
+                else:
+                    write_gains(gains, path)
             self._remove_earlier(folder, {path.name for path in work.iterdir()})
             for path in work.iterdir():
                 path.replace(folder / path.name)
@@ -350,19 +339,6 @@ class DataCalibration(DataStudy):
         for path in (folder / name for name in results_in(folder)):
             if path.name not in written and path.resolve() not in read:
                 path.unlink()
-
-    def _write_gains_also(self, work: Path) -> None:
-        """Write the gains of a folder in other formats."""
-        from pyuvdata import UVCal
-
-        if self.file.also:
-            gains = UVCal.from_file(work / GAINS)
-        for kind in self.file.also:
-            path = (work / GAINS).with_suffix(SUFFIXES[kind])
-            if kind == "calfits":
-                gains.write_calfits(str(path))
-            else:
-                write_gains(gains, path)
 
     def _solution(self, made: RunProducts, solved: Mapping[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         """Return the request, the changes of the data, what stands out, and every solve, as plain JSON types."""

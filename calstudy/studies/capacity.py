@@ -33,31 +33,24 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
 
     The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation, and
     does not change their key in the store. The result is the file, perhaps with more `simulation.chunks` and a
-    calibrator that needs less memory, and the number of workers that fit into the memory, or the requested number if no
-    memory was given. Raises InputError if a single task is estimated to need more memory than there is, or `max_memory`
-    is not an amount of memory; before any work starts.
+    calibrator that needs less memory, and the number of workers, which is the requested one if no memory was given.
+    Raises InputError if a single task is estimated to need more memory than there is.
     """
-    workers, scheduler = budget.workers, budget.scheduler
+    if budget.scheduler is not None:
+        return file, budget.workers or 1
     _require_sane(budget)
-    if scheduler is not None:
-        return file, workers or 1
     # The parent process has the libraries in memory, too.
     memory = budget.memory - LIBRARIES_MEMORY
-    hoped = workers or cores()
+    hoped = budget.workers or cores()
     lean = _stream(_cut(_Work(file, targets, budget.strict), memory / hoped), memory / hoped)
     return lean.file, _workers(lean.missing, memory, hoped, budget)
 
 
 def require_data_fit(experiment: Experiment, budget: Budget) -> None:
-    """Raise InputError if the data of an experiment alone exceed the memory by far.
-
-    This check is fast for any size. It precedes `fit` and the foreground bases, which take long for absurd sizes.
-    """
-    if budget.scheduler is not None:
-        return
+    """Raise InputError if the data alone exceed the memory by far, before `fit`, which takes long for absurd sizes."""
     samples = size_of_instrument(experiment.instrument).samples
     need = samples * COMPLEX128
-    if need > ABSURD * budget.memory:
+    if budget.scheduler is None and need > ABSURD * budget.memory:
         raise InputError(
             f"the data have {samples:.3g} samples, which take {need / 1e9:,.1f} GB, and there are "
             f"{budget.memory / 1e9:.1f} GB of memory; use fewer antennas, channels or integrations"
@@ -84,7 +77,7 @@ def _workers(missing: Sequence[Task], memory: float, hoped: int, budget: Budget)
 def _require_sane(budget: Budget) -> None:
     """Raise InputError if the number of workers exceeds the limit for this machine."""
     most = max(LEAST_LIMIT, WORKERS_PER_CORE * cores())
-    if budget.scheduler is None and budget.workers is not None and budget.workers > most:
+    if budget.workers is not None and budget.workers > most:
         raise InputError(
             f"--workers {budget.workers}: at most {most} are allowed on this machine, which has {cores()} processor "
             "core(s); leave it out for one per core"

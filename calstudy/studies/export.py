@@ -65,8 +65,8 @@ def export(
 ) -> list[Path]:
     """Write the data of every world, make products that are missing in the store, and return the folders.
 
-    The worlds are from `calstudy.studies.kinds.comparison.load_worlds`, with the calibrator `CARRIER`; several have
-    subfolders ``world-1`` and so on. Raises InputError as `folders_of` does, or if the data cannot be made.
+    The worlds are from `load_worlds`, with the calibrator `CARRIER`. Raises InputError as `folders_of` does, or if the
+    data cannot be made.
     """
     folders = folders_of(worlds, folder, file_format, overwrite)
     require_worlds(worlds)
@@ -90,7 +90,7 @@ def require_worlds(worlds: Comparison) -> None:
 
 
 def folders_of(worlds: Comparison, folder: Path, file_format: str, overwrite: bool) -> list[Path]:
-    """Return the folder of each world; parameters as for `export`.
+    """Return the folder of each world, ``world-1`` and so on of several.
 
     Raises InputError if there is no such format, files would be replaced without `overwrite`, or cannot be written, or
     gains would be taken for those of other data.
@@ -110,34 +110,20 @@ def folders_of(worlds: Comparison, folder: Path, file_format: str, overwrite: bo
         require_writable(place, f"--output {place}")
         if not overwrite and place.is_dir() and any(place.iterdir()):
             raise InputError(f"--output {place}: holds files already; use --overwrite or another folder")
-        _require_none_returned(WorldData.of(case.experiment, worlds.file.salt).digest, place)
+        found = [path.name for suffix in RETURNED for path in sorted(place.glob(f"data-*{suffix}"))]
+        if found and _earlier(place).digest != WorldData.of(case.experiment, worlds.file.salt).digest:
+            raise InputError(
+                f"--output {place}: holds what was returned for other data, {', '.join(found)}; move these files away, "
+                "or use another folder"
+            )
     return folders
 
 
-def _require_none_returned(digest: str, folder: Path) -> None:
-    """Raise InputError if a folder has gains or models that were found for data of another digest."""
-    found = [path.name for suffix in RETURNED for path in sorted(folder.glob(f"data-*{suffix}"))]
-    earlier = _earlier(folder)
-    if found and (earlier is None or earlier.digest != digest):
-        raise InputError(
-            f"--output {folder}: holds what was returned for other data, {', '.join(found)}; move these files away, or "
-            "use another folder"
-        )
-
-
-def _remove_earlier(folder: Path) -> None:
-    """Remove the data and the sky model of an earlier export, whose names end otherwise in other formats."""
-    if (earlier := _earlier(folder)) is not None:
-        for name in (*(item.file for item in earlier.data), earlier.sky_model):
-            if name is not None and OWN.fullmatch(name):
-                _remove(folder / name)
-
-
-def _earlier(folder: Path) -> Manifest | None:
-    """Return the manifest of an earlier export, or None if there is none that can be read."""
+def _earlier(folder: Path) -> Manifest:
+    """Return the manifest of an earlier export; an empty one if there is none that can be read."""
     with suppress(InputError):
         return read_manifest(folder / MANIFEST)
-    return None
+    return Manifest(calstudy="", digest="", data=())
 
 
 def _remove(path: Path) -> None:
@@ -149,7 +135,11 @@ def _remove(path: Path) -> None:
 def _write_world(content: WorldData, products: Mapping[str, Product], folder: Path, file_format: str) -> None:
     from calstudy.instrument.telescope import make_template
 
-    _remove_earlier(folder)
+    # Their names end otherwise in other formats.
+    earlier = _earlier(folder)
+    for name in (*(item.file for item in earlier.data), earlier.sky_model):
+        if name is not None and OWN.fullmatch(name):
+            _remove(folder / name)
     template = make_template(assumed_world(content.experiment).instrument, as_built=True)
     # A layout may be named after a file.
     template.telescope.name = template.telescope.instrument = "calstudy"
@@ -159,16 +149,16 @@ def _write_world(content: WorldData, products: Mapping[str, Product], folder: Pa
         file = f"data-{number}.{file_format}"
         _write(_at(template, read_visibilities(products[task.key].path / DATA)), folder / file, single=True)
         sets.append(DataSet(name=f"data-{number}", file=file, digest=salted(task.key, content.salt)))
-    model = content.sky_model
+    model, model_file = content.sky_model, f"{SKY_MODEL}.{file_format}"
     if model is not None:
         sky = read_visibilities(products[model.key].path / VISIBILITIES)
-        _write(_at(template, sky), folder / f"{SKY_MODEL}.{file_format}", single=False)
+        _write(_at(template, sky), folder / model_file, single=False)
     level = content.noise_level
     manifest = Manifest(
         calstudy=__version__,
         digest=content.digest,
         data=tuple(sets),
-        sky_model=None if model is None else f"{SKY_MODEL}.{file_format}",
+        sky_model=None if model is None else model_file,
         sky_model_digest=None if model is None else salted(model.key, content.salt),
         noise=None if level is None else read_noise(products[level.key].path),
     )
@@ -246,16 +236,16 @@ BITS = 128
 def write_recipe(worlds: Comparison, path: Path) -> str:
     """Write a comparison with secret seeds and a secret salt, for its owner alone; return the SHA-256 of the file.
 
-    Data with the EoR and without have separate noise. Only the seeds of the comparison are replaced; `export` and
-    `score` accept the new YAML file in its place. Raises InputError if the file exists already, cannot be written, or
-    cannot be read back.
+    Only the seeds of the comparison are replaced; `export` and `score` accept the new YAML file in its place. Raises
+    InputError if the file exists already, cannot be written, or cannot be read back.
     """
-    experiments = {case.world: case.experiment for case in worlds.cases}
-    drawn = {
-        world: _replaced(worlds.resolved["worlds"].get(world, {}), _drawn(experiment))
-        for world, experiment in experiments.items()
-    }
-    recipe = {**worlds.resolved, "worlds": drawn, "salt": secrets.token_hex(BITS // 8)}
+    changes = {}
+    for world, experiment in {case.world: case.experiment for case in worlds.cases}.items():
+        drawn = _drawn(experiment)
+        # They come last: a seed that is set otherwise would come back.
+        given = worlds.resolved["worlds"].get(world, {})
+        changes[world] = {**{path: value for path, value in given.items() if path not in drawn}, **drawn}
+    recipe = {**worlds.resolved, "worlds": changes, "salt": secrets.token_hex(BITS // 8)}
     try:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
             yaml.safe_dump(recipe, file, sort_keys=False, allow_unicode=True, width=100)
@@ -273,11 +263,6 @@ def write_recipe(worlds: Comparison, path: Path) -> str:
     return sha256(path)
 
 
-def _replaced(changes: Mapping[str, Any], drawn: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the changes of a world with new seeds, which come last: a seed that is set otherwise would come back."""
-    return {**{path: value for path, value in changes.items() if path not in drawn}, **drawn}
-
-
 def _drawn(experiment: Experiment) -> dict[str, Any]:
     """Return new seeds of all random draws of an experiment, by dotted path."""
     full = experiment.model_dump(mode="json", include={"instrument", "sky", "corruption"})
@@ -290,6 +275,5 @@ def _drawn(experiment: Experiment) -> dict[str, Any]:
         block, _, name = path.rpartition(".")
         differs = block in DRAWN or path.startswith(above) or any(one.startswith(f"{block}.") for one in changed)
         if name in SEEDS and differs:
-            two = [secrets.randbits(BITS) for _ in range(2)]
-            found[path] = two[0] if name == "seed" else two
+            found[path] = secrets.randbits(BITS) if name == "seed" else [secrets.randbits(BITS) for _ in range(2)]
     return found

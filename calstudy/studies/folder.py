@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 from calstudy.base.errors import InputError, errors_of_files, exit_status
+from calstudy.base.files import replacing
 from calstudy.experiment.model import Folders
 from calstudy.results.reader import EXPERIMENT, MANIFEST
 from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
@@ -27,10 +27,7 @@ LEFTOVER = re.compile(r"\..+-[0-9a-f]{32}")
 
 
 def open_folder(folder: Path, subfolders: Sequence[str]) -> None:
-    """Make a run folder; raises InputError if it contains files that are not from a run.
-
-    `subfolders` are those that a run writes besides figures and tables.
-    """
+    """Make a run folder, which may have figures, tables and subfolders; raises InputError if no run wrote its files."""
     results = {"report.html", "figures", "tables", *subfolders, "regression.json"}
     known = results | {MANIFEST, EXPERIMENT, LOG, *CLAIMS_FILES}
     with errors_of_files(f"outputs.runs = {str(folder.parent)!r}: cannot be written"):
@@ -97,9 +94,8 @@ def _remove_leftovers(folder: Path) -> None:
 
 def write(path: Path, text: str) -> None:
     """Write a text file completely or not at all."""
-    partial = path.with_name(f".{path.name}-{uuid4().hex}")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def publish(products: list[Product], folder: Path) -> None:
@@ -107,36 +103,26 @@ def publish(products: list[Product], folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     for product in products:
         for name in product.record["files"]:
-            partial = folder / f".{name}-{uuid4().hex}"
-            shutil.copyfile(product.path / name, partial)
-            partial.replace(folder / name)
+            with (product.path / name).open("rb") as made, replacing(folder / name) as file:
+                shutil.copyfileobj(made, file)
 
 
 def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
-    """Write manifest.json: the fields of a study, with time, commit, versions and machine.
-
-    The fields may replace the machine.
-    """
+    """Write manifest.json: the fields of a study, with time, commit, versions and machine, which they may replace."""
     manifest = {
         "name": name,
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "git_commit": git_commit(),
         "versions": package_versions(),
         "machine": machine(),
-        "other_code": other_code([entry["stage"] for entry in fields.get("products", ()) if "made_with" in entry]),
+        "other_code": other_code([entry["stage"] for entry in fields["products"] if "made_with" in entry]),
         **fields,
     }
-    write(folder / MANIFEST, _as_json(manifest))
+    # A line for each product: comparisons have more than a thousand.
+    lines = ",\n  ".join(json.dumps(entry) for entry in manifest.pop("products"))
+    text = json.dumps(manifest, indent=1).removesuffix("\n}")
+    write(folder / MANIFEST, f'{text},\n "products": [\n  {lines}\n ]\n}}')
     _remove_leftovers(folder)
-
-
-def _as_json(manifest: Mapping[str, Any]) -> str:
-    """Return a manifest as JSON with a line for each product; comparisons have more than a thousand."""
-    if not manifest.get("products"):
-        return json.dumps(manifest, indent=1)
-    text = json.dumps({key: value for key, value in manifest.items() if key != "products"}, indent=1)
-    lines = ",\n  ".join(json.dumps(entry) for entry in manifest["products"])
-    return text.removesuffix("\n}") + f',\n "products": [\n  {lines}\n ]\n}}'
 
 
 RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs", "lineage")
@@ -148,22 +134,21 @@ MADE_WITH = ("made_with", "git_commit", "processor", "libraries")
 def product_entries(
     tasks: Sequence[Task], products: Mapping[str, Product], made: Sequence[Task], tables: Sequence[Task] = ()
 ) -> list[dict[str, Any]]:
-    """Return the manifest's entry of every product: its inputs, its cost, and the run that made it.
+    """Return the manifest's entry of every product that there is: its inputs, its cost, and whether this run made it.
 
-    Products of other code or other package versions than the run's also have these versions. Tasks without a product
-    are omitted; `made` are the tasks whose products this run made. The entries of `tables`, whose files are the
-    tables of the run folder, have the SHA-256 of each file.
+    Products of other code or other package versions than the run's also have these versions. The entries of `tables`,
+    whose files are the tables of the run folder, have the SHA-256 of each file.
     """
     keys, published = {task.key for task in made}, {task.key for task in tables}
-    other = of_other_code(unique(tasks), {task.key: products[task.key] for task in tasks if task.key in products})
+    found = [task for task in tasks if task.key in products]
+    other = of_other_code(unique(found), {task.key: products[task.key] for task in found})
     entries = []
-    for task in tasks:
-        if task.key in products:
-            record = products[task.key].record
-            entry = {"stage": task.stage.name, **{field: record[field] for field in RECORDED}}
-            if task.key in published:
-                entry["files"] = {name: file["sha256"] for name, file in record["files"].items()}
-            if task.key in other:
-                entry |= {field: record.get(field) for field in MADE_WITH}
-            entries.append({**entry, "made_by_this_run": task.key in keys})
+    for task in found:
+        record = products[task.key].record
+        entry = {"stage": task.stage.name, **{field: record[field] for field in RECORDED}}
+        if task.key in published:
+            entry["files"] = {name: file["sha256"] for name, file in record["files"].items()}
+        if task.key in other:
+            entry |= {field: record.get(field) for field in MADE_WITH}
+        entries.append({**entry, "made_by_this_run": task.key in keys})
     return entries

@@ -13,13 +13,9 @@ from calstudy.studies.study import KINDS, Study, kind_of
 def load_study(path: Path, scale: str | None = None, overrides: Sequence[str] = ()) -> Study:
     """Read a YAML file, or a published one by its name, such as ``quickstart``, and return the study that it describes.
 
-    The kind of study is that whose `key` the file has, or that which its key `study` names; it is an experiment if
-    there is neither. An experiment with the key `sweep` is the family of its points, with `realizations` all its
-    realizations. Overrides are ``path=value`` texts, applied after the scale of the file's `scales`; those of a
-    collection are applied to every member.
-
-    Raises InputError if a file cannot be read, or a scale or override cannot be applied, and ExperimentError if fields
-    are unknown, missing, or have values that are not allowed.
+    Overrides are ``path=value`` texts, applied after the scale of the file's `scales`. Raises InputError if a file
+    cannot be read, or a scale or override cannot be applied, and ExperimentError if fields are unknown, missing, or
+    have values that are not allowed.
     """
     return study_of(StudyFile.open(path, scale, overrides))
 

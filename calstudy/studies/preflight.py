@@ -26,7 +26,6 @@ from calstudy.power.interface import require_antennas, require_modes
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
-from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.counts import expected_sources
 from calstudy.sky.settings import Eor, FileSources, Foregrounds, GleamSources, PointSources, SyntheticSources
 
@@ -72,23 +71,29 @@ def _require_eor(eor: Eor, instrument: InstrumentSettings) -> None:
 
 def _require_catalogue(experiment: Experiment) -> None:
     """Raise InputError if a file of sources, of the data or assumed, cannot be used for the channels."""
-    channels, foregrounds = experiment.instrument.channels, experiment.sky.foregrounds
+    foregrounds = experiment.sky.foregrounds
     if isinstance(foregrounds, FileSources) or (isinstance(foregrounds, GleamSources) and foregrounds.path is not None):
-        _kept(foregrounds, channels)
-    if isinstance(other := assumed_world(experiment).sky.foregrounds, FileSources):
-        try:
-            _kept(other, channels)
-        except InputError as error:
-            raise InputError(f"{FIELD}.{error}") from None
+        _kept(foregrounds, experiment.instrument.channels)
+    if isinstance(assumed_world(experiment).sky.foregrounds, FileSources):
+        _kept_of_assumed(experiment)
+
+
+def _kept_of_assumed(experiment: Experiment) -> int | None:
+    """Return the number of sources that are assumed, as `_kept`; errors name the field of what is assumed."""
+    try:
+        return _kept(assumed_world(experiment).sky.foregrounds, experiment.instrument.channels)
+    except InputError as error:
+        raise InputError(f"{FIELD}.{error}") from None
 
 
 def require_fine_maps(eor: Eor, lengths: np.ndarray, band: tuple[float, float], field: str) -> None:
     """Raise InputError if finer maps of an EoR have what the longest baseline sees; baseline `lengths` are in m.
 
     Maps of a spectrum that is not flat end at l = 3 nside - 1. Beyond it baselines see replicas of what is below, with
-    a sixth to all of the power of the spectrum. `field` is the name of the EoR's section.
+    a sixth to all of the power of the spectrum.
     """
-    longest, seen = lengths.max(initial=0.0), _multipole(lengths.max(initial=0.0), band)
+    longest = lengths.max(initial=0.0)
+    seen = _multipole(longest, band)
     enough = min(2 ** math.ceil(math.log2((seen + 1) / 3)), FINEST)
     if eor.spectrum != "flat" and eor.nside < enough:
         raise InputError(
@@ -133,7 +138,7 @@ def _require_small_errors(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    found = (_needless_limit, _average, _needless_chunks, _needless_pieces, _distant_box, _coarse_maps)
+    found = (_needless_limit, _average, _distant_box, _coarse_maps)
     return tuple(note for note in (note(experiment) for note in found) if note)
 
 
@@ -145,13 +150,8 @@ def _needless_limit(experiment: Experiment) -> str:
     skies = [sky.foregrounds for sky in (experiment.sky, assumed_world(experiment).sky)]
     if len({sky.with_defaults("flux_limit", "count", "errors") for sky in skies if isinstance(sky, PointSources)}) != 1:
         return ""
-    true, other = skies
-    kept = _kept(true, experiment.instrument.channels)
-    try:
-        used = _kept(other, experiment.instrument.channels)
-    except InputError as error:
-        raise InputError(f"{FIELD}.{error}") from None
-    if kept is None or kept != used:
+    kept = _kept(skies[0], experiment.instrument.channels)
+    if _kept_of_assumed(experiment) != kept or kept is None:
         return ""
     return f"{FIELD}.{limit} = {str(assumed[limit])!r}: leaves out no source: all {kept} are brighter"
 
@@ -161,21 +161,6 @@ def _require_another_sky(experiment: Experiment) -> None:
     needless = _needless_limit(experiment)
     if needless and len(assumed_changes(experiment.calibration.assumed)) == 1:
         raise InputError(f"{needless}; give a higher limit, or a smaller {FIELD}.sky.foregrounds.count")
-
-
-def _needless_chunks(experiment: Experiment) -> str:
-    chunks, channels = experiment.simulation.chunks, experiment.instrument.channels.count
-    if chunks <= max(channels, SimulationSettings().chunks):
-        return ""
-    return f"simulation.chunks = {chunks}: the EoR is simulated in {channels} parts, for there are no more channels"
-
-
-def _needless_pieces(experiment: Experiment) -> str:
-    settings, times = experiment.calibration, experiment.instrument.times.count
-    solves = math.ceil(times / settings.integrations_per_solve)
-    if settings.chunks <= max(solves, type(settings).model_fields["chunks"].default):
-        return ""
-    return f"calibration.chunks = {settings.chunks}: there are {solves} pieces, one for each solve"
 
 
 def _average(experiment: Experiment) -> str:
@@ -248,10 +233,7 @@ def require_calibration(experiment: Experiment) -> None:
 
 
 def refusal_of_calibrator(experiment: Experiment) -> str:
-    """Return the reason why the calibrator cannot work on the data of an experiment, or an empty text.
-
-    Raises InputError for an array that cannot be made, because the calibrator does not refuse it.
-    """
+    """Return why the calibrator cannot work on the data, or an empty text; InputError if the array cannot be made."""
     make_array(experiment.instrument)
     try:
         _require_calibrators(experiment)
@@ -262,17 +244,16 @@ def refusal_of_calibrator(experiment: Experiment) -> str:
 
 def _require_calibrators(experiment: Experiment) -> None:
     """Raise InputError if the calibrator of any data set refuses it; usually all data sets have the same calibrator."""
-    graph = Graph(experiment)
-    asked: list[Calibrator] = []
+    graph, settings = Graph(experiment), experiment.calibration
+    asked: dict[int, Calibrator] = {}
     for variant in experiment.variants.values():
         for parity in PARITIES if variant.calibrate else ():
             model = sky_model(graph)
-            calibrator = experiment.calibration.for_data(data(graph, variant, parity).key, model.key if model else None)
-            if not any(calibrator is other for other in asked):
-                asked.append(calibrator)
-                frame = frame_of(experiment.instrument)
-                given = SKY_MODEL in assumed_changes(experiment.calibration.assumed)
-                require_calibratable(calibrator, frame, given or assumed_world(experiment).sky.has_foregrounds)
+            calibrator = settings.for_data(data(graph, variant, parity).key, model.key if model else None)
+            asked[id(calibrator)] = calibrator
+    has_model = SKY_MODEL in assumed_changes(settings.assumed) or assumed_world(experiment).sky.has_foregrounds
+    for calibrator in asked.values():
+        require_calibratable(calibrator, frame_of(experiment.instrument), has_model)
 
 
 def _require_same_antennas(true: Layout, assumed: Layout) -> None:

@@ -149,10 +149,7 @@ def _any_of(kinds: Kinds[Any], path: str, listed: dict[str, str]) -> Iterator[st
 
 
 def plugin_reference(path: Path) -> str:
-    """Return the Markdown reference of the plug-ins (calibrators, figures and others) in a Python file.
-
-    Raises InputError if the file cannot be run, or contains none.
-    """
+    """Return the Markdown reference of the plug-ins in a Python file; InputError if it cannot be run, or has none."""
     module = load_file(path)
     own = [thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__]
     kinds = [thing for thing in own if issubclass(thing, Study)]
@@ -172,10 +169,7 @@ def plugin_reference(path: Path) -> str:
 
 
 def section_reference(section: str) -> str:
-    """Return the part of the reference with one section, such as ``calibration.basis``, and the sections inside it.
-
-    Raises InputError if there is no such section.
-    """
+    """Return the reference of a section, such as ``calibration.basis``, and of those in it; InputError without one."""
     sections: list[str] = []
     for kind_of_file in re.split(r"^(?=# )", field_reference(), flags=re.MULTILINE):
         parts = re.split(r"^(?=##+ `([\w.]+))", kind_of_file, flags=re.MULTILINE)[1:]

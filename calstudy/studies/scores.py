@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field, StringConstraints, TypeAdapter, Validati
 from rich.console import Console
 
 from calstudy import __version__
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.files import digest_json, sha256
 from calstudy.base.identity import identity
 from calstudy.base.schema import Section
@@ -23,9 +23,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.power.score import BANDS
 from calstudy.products.comparison import score_table
 from calstudy.products.files import SCORE, read_json
-from calstudy.products.graph import Graph, required
 from calstudy.products.score import MEASURED
-from calstudy.products.score import score as score_task
 from calstudy.products.tolerances import COUNTS
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Store
@@ -35,6 +33,8 @@ from calstudy.studies.study import make
 from calstudy.verdicts.standing import LARGEST_ERROR, is_measured, standing_table, standings, upper_limit
 
 LOG = "score.log"
+NUMBERS = ("bias", "bias_error", "transfer", "transfer_error")
+"""Fields of a band that decide whether it counts."""
 VERIFIED = "verified.txt"
 """File of the page's maintainer: lines of the SHA-256 of a file of scores, and who repeated its scoring."""
 Label = Annotated[str, StringConstraints(pattern=r"^[\w(][\w.,:;()+\-−±%=°'² ]*$", max_length=80)]
@@ -92,8 +92,7 @@ class _Summary(Section):
 class Row(Section):
     """The scores of one calibrator in one world.
 
-    `digest` is that of the data and the sky model of the world, as in the manifest of an export; `scoring` that of
-    the definition of spectra and scores (`scoring_of`).
+    `digest` is that of data and sky model, as in the manifest of an export; `scoring` is from `scoring_of`.
     """
 
     world: Label
@@ -117,11 +116,7 @@ class Row(Section):
 
 
 class Scores(Section):
-    """Content of a file of scores.
-
-    `calstudy` is the version that measured them. Rows are ordered by world; a refusal has world, calibrator and
-    reason.
-    """
+    """Content of a file of scores; a refusal has world, calibrator and reason."""
 
     calstudy: str
     name: Label
@@ -135,16 +130,17 @@ def scoring_of(experiment: Experiment) -> str:
 
 
 def measure_scores(study: Comparison, budget: Budget, console: Console) -> Scores:
-    """Return the scores of all cases of a comparison, and make products that are missing in the store.
-
-    The study comes from `calstudy.studies.kinds.comparison.load_worlds`.
-    """
-    for label in {study.name, *(label for case in study.cases for label in (case.world, case.calibrator))}:
-        _require_label(label)
+    """Return the scores of all cases of a comparison, from `load_worlds`, and make products that are missing."""
+    for label in (study.name, *study.file.worlds, *study.file.calibrators):
+        try:
+            TypeAdapter(Label).validate_python(label)
+        except ValidationError:
+            raise InputError(
+                f"{label!r}: cannot label a row of scores; use at most 80 letters, digits, spaces and "
+                ". , : ; ( ) + - % = '"
+            ) from None
     study, count = study.sized_to(budget)
-    runs = folder_of_runs(study.outputs)
-    cases = [case for case in study.cases if not case.refusal]
-    tasks = [required(score_task(Graph(case.experiment, keep_visibilities=False))) for case in cases]
+    runs, tasks = folder_of_runs(study.outputs), list(study.scores.values())
     with log_to(runs / LOG):
         workers = Workers(count, runs / LOG, budget.scheduler)
         made = make(tasks, Store(study.outputs.store), workers, console)
@@ -156,19 +152,9 @@ def measure_scores(study: Comparison, budget: Budget, console: Console) -> Score
             scoring=scoring_of(case.experiment),
             scores=read_json(made.products[task.key].path / SCORE),
         )
-        for case, task in zip(cases, tasks, strict=True)
+        for case, task in zip((case for case in study.cases if not case.refusal), tasks, strict=True)
     ]
-    refusals = tuple((case.world, case.calibrator, case.refusal) for case in study.cases if case.refusal)
-    return Scores(calstudy=__version__, name=study.name, rows=tuple(rows), refusals=refusals)
-
-
-def _require_label(label: str) -> None:
-    try:
-        TypeAdapter(Label).validate_python(label)
-    except ValidationError:
-        raise InputError(
-            f"{label!r}: cannot label a row of scores; use at most 80 letters, digits, spaces and . , : ; ( ) + - % = '"
-        ) from None
+    return Scores(calstudy=__version__, name=study.name, rows=tuple(rows), refusals=tuple(study.refused))
 
 
 def tables(scores: Scores) -> dict[str, Table]:
@@ -182,9 +168,8 @@ def tables(scores: Scores) -> dict[str, Table]:
 def read_scores(path: Path) -> Scores:
     """Read a file of scores; raises InputError if it is not one."""
     try:
-        return Scores.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        with errors_of_files(f"{path}: cannot be read"):
+            return Scores.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise InputError(f"{path}: is not a file of 'calstudy score --output' ({_first(error)})") from None
 
@@ -207,12 +192,11 @@ class _Standing:
     def of(cls, row: Row) -> _Standing:
         limits, kept = [], []
         for band in row.scores["bands"]:
-            known = None not in (band["bias"], band["bias_error"], band["transfer"], band["transfer_error"])
-            limit = upper_limit(band["bias"], band["bias_error"]) if known else float("inf")
-            limits.append(limit)
+            bias, bias_error, transfer, error = (band[name] for name in NUMBERS)
+            known = None not in (bias, bias_error, transfer, error)
+            limits.append(upper_limit(bias, bias_error) if known else float("inf"))
             # No calibration can leave more than the whole signal, or less than nothing.
-            transfer, error = band["transfer"], band["transfer_error"]
-            if limit < COUNTS and is_measured(transfer, error) and -error <= transfer <= 1 + error:
+            if limits[-1] < COUNTS and is_measured(transfer, error) and -error <= transfer <= 1 + error:
                 kept.append(transfer)
         return cls(len(kept), len(limits), sum(kept) / len(kept) if kept else 0.0, min(limits))
 
@@ -226,11 +210,7 @@ class _Standing:
 
 
 def leaderboard(folder: Path) -> str:
-    """Return a page (Markdown) that ranks all files of `calstudy score --output` in a folder.
-
-    Raises InputError if there are none, or they do not belong together: other data under the same name of a world, or a
-    calibrator that occurs twice in a world.
-    """
+    """Return a page (Markdown) that ranks the files of scores in a folder; InputError if they do not fit together."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     paths = sorted(folder.glob("*.json"))
@@ -253,15 +233,9 @@ def leaderboard(folder: Path) -> str:
     for world, rows in worlds.items():
         ranked = sorted(rows.values(), key=lambda row: _Standing.of(row).order)
         lines += [f"## {world}", "", score_table({row.calibrator: row.scores for row in ranked}).markdown()]
-        refused = [
-            (calibrator, why)
-            for scores in found.values()
-            for place, calibrator, why in scores.refusals
-            if place == world
-        ]
-        lines += [f"- {calibrator} cannot work here: {one_line(why)}" for calibrator, why in refused] + (
-            [""] if refused else []
-        )
+        refusals = (refusal for scores in found.values() for refusal in scores.refusals)
+        refused = [f"- {name} cannot work here: {one_line(why)}" for place, name, why in refusals if place == world]
+        lines += [*refused, ""] if refused else []
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,22 +96,22 @@ def show_plan(plan: Mapping[str, Any], console: Console) -> None:
         costs = (duration(row["seconds"]), _gigabytes(row["memory_each"]), _gigabytes(row["disk"]))
         rows.append((row["stage"], str(row["products"]), str(row["to_make"]), *(costs if row["to_make"] else "---")))
     Table(columns, rows, f"{plan['name']}: plan for {plan['workers']} worker(s)").show(console)
-    if plan["setup"]:
-        console.print(plan["setup"], markup=False)
-    for product in plan["damaged"]:
-        console.print(f"damaged, will be made again: {product}", markup=False)
-    for sentence in plan["other_code"]:
-        console.print(sentence, markup=False)
-    _show_total(plan, console)
-    for heading, lines in (("stand-in", "stand_ins"), ("note", "notes"), ("site", "sites")):
-        for line in plan[lines]:
-            console.print(f"{heading}: {line}", markup=False)
-    console.print(f"store: {plan['store']}", markup=False, soft_wrap=True)
+    lines = [plan["setup"]] if plan["setup"] else []
+    lines += [f"damaged, will be made again: {product}" for product in plan["damaged"]]
+    lines += [*plan["other_code"], _total(plan)]
+    for heading, kind in (("stand-in", "stand_ins"), ("note", "notes"), ("site", "sites")):
+        lines += [f"{heading}: {line}" for line in plan[kind]]
+    _print(lines, console)
     folders = plan["run_folders"]
-    for folder in folders[:NAMED]:
-        console.print(f"run folder: {folder}", markup=False, soft_wrap=True)
+    places = [f"store: {plan['store']}", *(f"run folder: {folder}" for folder in folders[:NAMED])]
+    console.print("\n".join(places), markup=False, soft_wrap=True)
     if len(folders) > NAMED:
         console.print(f"and {len(folders) - NAMED} run folders more; --json names all")
+
+
+def _print(lines: Iterable[str], console: Console) -> None:
+    for line in lines:
+        console.print(line, markup=False)
 
 
 def sites(tasks: Sequence[Task]) -> list[str]:
@@ -120,11 +120,10 @@ def sites(tasks: Sequence[Task]) -> list[str]:
     return list(dict.fromkeys(describe(found.site) for found in instruments))
 
 
-def _show_total(plan: Mapping[str, Any], console: Console) -> None:
+def _total(plan: Mapping[str, Any]) -> str:
     if not any(row["to_make"] for row in plan["stages"]):
-        console.print("everything is in the store: a run only writes its folder")
-        return
-    console.print(
+        return "everything is in the store: a run only writes its folder"
+    return (
         f"in all: about {duration(plan['seconds'] / plan['workers'])}, "
         f"up to {_gigabytes(plan['memory'])} of memory ({_gigabytes(plan['memory_free'])} free), "
         f"{_gigabytes(plan['disk_while_running'])} of disk while running, {_gigabytes(plan['disk_kept'])} kept"
@@ -157,72 +156,53 @@ def _show_products(run: Run, console: Console) -> None:
         cost = (duration(seconds), _gigabytes(memory)) if records else "--"
         rows.append((stage, str(len(records)), str(stored), *cost))
     Table(("stage", "made", "from store", "cpu time", "peak memory"), rows, "products").show(console)
-    for warning in run.warnings:
-        console.print(f"warning: {warning}", markup=False)
-    _show_signal(run.folder, console)
-    _show_answer(run.folder, console)
-    for figure in sorted((run.folder / "figures").glob("*.png")):
-        console.print(f"figure: {figure}", markup=False)
-    if (run.folder / "tables").is_dir():
-        console.print(f"tables: {run.folder / 'tables'}", markup=False)
-    console.print(f"manifest: {run.folder / MANIFEST}", markup=False)
-    if (run.folder / REPORT).is_file():
-        console.print(f"report: {run.folder / REPORT}", markup=False)
+    folder = run.folder
+    _print([*(f"warning: {warning}" for warning in run.warnings), *_signal(RunFolder(folder))], console)
+    _show_answer(RunFolder(folder), console)
+    _print((f"figure: {figure}" for figure in sorted((folder / "figures").glob("*.png"))), console)
+    files = {"tables": folder / "tables", "manifest": folder / MANIFEST, "report": folder / REPORT}
+    _print((f"{name}: {path}" for name, path in files.items() if path.exists()), console)
 
 
-def _show_signal(folder: Path, console: Console) -> None:
-    """Print what was calibrated, T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
-    run = RunFolder(folder)
-    if "setup" in run.manifest:
-        console.print(run.manifest["setup"], markup=False)
+def _signal(run: RunFolder) -> list[str]:
+    """Return what was calibrated, T and bias of a run, if it has them, and a warning if the bias exceeds the EoR."""
+    lines = [run.manifest["setup"]] if "setup" in run.manifest else []
     signal = read_signal(run)
     if signal is None:
-        for number in measured_numbers(run):
-            console.print(f"{number.name}: {number.text}", markup=False)
-        return
+        return [*lines, *(f"{number.name}: {number.text}" for number in measured_numbers(run))]
     numbers = ", ".join(f"{number.name} {number.text}" for number in signal.numbers)
-    console.print(f"{PLACE}: {numbers}", markup=False)
-    if signal.excess is not None:
-        console.print(f"warning: {signal.excess}", markup=False)
+    return [*lines, f"{PLACE}: {numbers}", *([f"warning: {signal.excess}"] if signal.excess is not None else [])]
 
 
-def _show_answer(folder: Path, console: Console) -> None:
+def _show_answer(run: RunFolder, console: Console) -> None:
     """Print which calibrators of a comparison pass, or T of every point of a sweep; nothing for other runs."""
-    run = RunFolder(folder)
     found = run.standings()
-    if not found:
-        for table in run.shown if run.parts else ():
-            table.show(console, numbers=False)
-        return
-    table = standing_table(found)
-    table.show(console, numbers=False)
-    console.print(table.note, markup=False)
-    for sentence in advice(found):
-        console.print(sentence, markup=False)
+    for table in [standing_table(found)] if found else run.shown if run.parts else []:
+        table.show(console, numbers=False)
+        _print([table.note, *advice(found)] if found else [], console)
 
 
 def _show_criteria(folder: Path, console: Console) -> None:
     """Print the verdicts on the criteria for the realizations of an experiment; nothing for other runs."""
     path = folder / "tables" / REALIZATIONS
     if verdicts := RunFolder(folder).verdicts(path):
-        for verdict in verdicts:
-            text = f"{verdict.name}: {verdict.verdict}: {measured(verdict)}, must be {verdict.threshold}"
-            console.print(text, markup=False)
-        console.print(f"criteria: {tally(verdicts)}: {path.with_suffix('.md')}", markup=False)
+        lines = [f"{item.name}: {item.verdict}: {measured(item)}, must be {item.threshold}" for item in verdicts]
+        _print([*lines, f"criteria: {tally(verdicts)}: {path.with_suffix('.md')}"], console)
 
 
 def _show_claims(folder: Path, console: Console) -> None:
     """Print the counts of claims of a run, the contradicted ones, and the file of all; nothing without claims."""
     finished = RunFolder(folder)
     verdicts = finished.claims
-    for verdict in verdicts:
-        if verdict.verdict == "contradicted":
-            text = f"claim contradicted: {verdict.name}: {measured(verdict)}, must be {verdict.threshold}"
-            console.print(text, markup=False)
-    if verdicts:
-        console.print(f"claims: {tally(verdicts)}: {folder / CLAIMS_MARKDOWN}", markup=False)
-    elif finished.has_claims:
-        text = "claims: none, for the run plays no role in the papers that it names; for the reasons see"
-        console.print(f"{text} {folder / CLAIMS_MARKDOWN}", markup=False)
+    lines = [
+        f"claim contradicted: {item.name}: {measured(item)}, must be {item.threshold}"
+        for item in verdicts
+        if item.verdict == "contradicted"
+    ]
+    none = "none, for the run plays no role in the papers that it names; for the reasons see"
+    if finished.has_claims:
+        counted = f"{tally(verdicts)}:" if verdicts else none
+        lines.append(f"claims: {counted} {folder / CLAIMS_MARKDOWN}")
     if (folder / BY_SOLVER_MARKDOWN).is_file():
-        console.print(f"claims by solver: {folder / BY_SOLVER_MARKDOWN}", markup=False)
+        lines.append(f"claims by solver: {folder / BY_SOLVER_MARKDOWN}")
+    _print(lines, console)

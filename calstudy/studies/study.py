@@ -47,11 +47,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunProducts:
-    """Products of a study.
-
-    `products`, by key, are those that were made or looked up, and all others behind them that are still in the
-    store. `tasks` are those whose products were made; the others were in the store.
-    """
+    """Products that were made or looked up, and those behind them that are in the store, by key; `tasks` were made."""
 
     products: Mapping[str, Product]
     tasks: tuple[Task, ...]
@@ -65,10 +61,7 @@ class RunProducts:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, its products, all tasks whose products it made or looked up, and runs of its parts.
-
-    The folder contains the resolved file, the manifest, the log, figures and tables; parts have their own, by name.
-    """
+    """A finished run: its folder, products, all tasks whose products it made or looked up, and runs of its parts."""
 
     folder: Path
     made: RunProducts
@@ -97,17 +90,9 @@ class Study(ABC):
     """The content of a file: an experiment, a family of experiments, measured data, run times.
 
     A kind of study is a subclass in a file of its own: a module of `calstudy.studies.kinds`, or a file or an
-    installed package that the key `study` of a file names.
-
-    Attributes
-    ----------
-    key : the key that marks a file of a built-in kind
-    model : the content of a file
-    heading, guide : of the kind in the reference of all fields, and what is written there about its files
-    subfolders : folders in the run folder besides figures and tables
-    keeps_tables
-        True if the manifest lists the files of the tables with digests, so that a collection can take them from there.
-    has_reference : true if figures and claims of a run may be a reference for `calstudy regress`
+    installed package that the key `study` of a file names. Files of a built-in kind are marked by its `key`; the
+    reference of all fields has its heading and guide. With `keeps_tables`, the manifest lists the files of the tables
+    with digests, so that a collection can take them from there; with `has_reference`, `calstudy regress` makes it.
     """
 
     key: ClassVar[str] = ""
@@ -297,12 +282,11 @@ def make(
 ) -> RunProducts:
     """Make the products that are missing in the store with all their inputs, and report the progress.
 
-    A read-only store is sufficient if nothing is missing. With `strict`, products of other code or other package
-    versions are made again. Raises InputError if the store must be written and cannot be, or a stage refuses its input.
+    A read-only store is sufficient if nothing is missing. Raises InputError if the store must be written and cannot be,
+    or a stage refuses its input.
     """
-    lease = Lease(store)
-    is_complete = len(found_of(targets, store)) == len({task.key for task in targets})
-    is_complete = is_complete and not without_record(targets, store)
+    lease, keys = Lease(store), {task.key for task in targets}
+    is_complete = len(found_of(targets, store)) == len(keys) and not without_record(targets, store)
     if not is_complete:
         store.prepare()
     # A complete store is only read, unless a file turns out to be damaged; no other run removes its product.
@@ -315,13 +299,15 @@ def _make_missing(
 ) -> RunProducts:
     if plan.todo:
         store.prepare()
-    messages = [
-        f"{task.stage.name} ({task.label}): the product in the store is damaged, and is made again"
-        for task in plan.damaged
-    ]
-    for message in [*messages, *said_of_other_code(targets, plan, store)]:
-        logger.warning(message)
-        console.print(message, markup=False)
+
+    def warn(text: str) -> None:
+        logger.warning(text)
+        console.print(text, markup=False)
+
+    for task in plan.damaged:
+        warn(f"{task.stage.name} ({task.label}): the product in the store is damaged, and is made again")
+    for sentence in said_of_other_code(targets, plan, store):
+        warn(sentence)
     lifetimes = Lifetimes(targets, plan.todo)
     lifetimes.keep_found(store)
     lease.drop(lifetimes.unused())
@@ -332,10 +318,6 @@ def _make_missing(
             logger.info("%s (%s): %.1f s", task.stage.name, task.label, product.record["seconds"])
             show(task, product)
             lease.drop(lifetimes.after(task))
-
-        def warn(text: str) -> None:
-            logger.warning(text)
-            console.print(text, markup=False)
 
         products = execute(plan.todo, store, workers, done, warn, plan.again)
     # Of two runs at once, one finds what the other has made.
@@ -355,8 +337,7 @@ def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) ->
 def run_study(study: Study, budget: Budget | None = None, console: Console | None = None) -> Run:
     """Make all products of a study that are missing in the store, and fill its run folder; without console, silently.
 
-    Raises InputError if the study does not fit the machine, the store or a run folder cannot be written, or a stage
-    refuses its input.
+    Raises InputError as `make`, and if the study does not fit the machine or a run folder cannot be written.
     """
     budget, console = budget or Budget(), console or Console(quiet=True)
     study, count = study.sized_to(budget)

@@ -286,16 +286,18 @@ def test_not_converging_is_exit_code_3_and_says_which(command, data):
     [
         (["none.uvh5"], "'none.uvh5': no such file or folder"),
         (["data.uvh5", "./data.uvh5"], "data.uvh5 is given twice; leave one out"),
-        (["data.uvh5", "--solver", "newton"], "solver: 'newton' is not a choice"),
+        (["data.uvh5", "--set", "solver=newton"], "solver: 'newton' is not a choice"),
         (["data.uvh5", "--buffer", "50"], "basis.buffer: '50' has no unit"),
         (["data.uvh5", "--set", "bufer=3"], "bufer: unknown key"),
         (
             ["data.uvh5", "--set", "calibrator=delay-weighted"],
             "foreground_prior.noise: must be given, for the data",
         ),
-        (["data.uvh5", "--redundant", "--gains-only"], "--redundant and --gains-only: choose one"),
-        (["data.uvh5", "--gains-only"], "calibration.calibrator = 'sky-based': needs a sky model"),
-        (["data.uvh5", "--gains-only", *OPTIONS], "calibration.basis: 'sky-based' has no such key, but calamity"),
+        (["data.uvh5", "--set", "calibrator=sky-based"], "calibration.calibrator = 'sky-based': needs a sky model"),
+        (
+            ["data.uvh5", "--set", "calibrator=sky-based", *OPTIONS],
+            "calibration.basis: 'sky-based' has no such key, but calamity",
+        ),
         (["data.uvh5", "--gains", "no.calh5"], "calibration.initial_gains.path = 'no.calh5': no such file"),
         (["data.uvh5", "--weights", "no.h5"], "--weights no.h5: neither gains, flags, nsamples or autos, nor a file"),
         (["data.uvh5", "--select", "antennas=3"], "--select antennas: '3' is not in the data"),

@@ -20,7 +20,7 @@ from calstudy.realdata.quality import assess
 from calstudy.realdata.reading import prepare
 from calstudy.realdata.selection import Selection, select
 
-OPTIONS = ["--gains-only"]
+OPTIONS = ["--set", "calibrator=sky-based"]
 N_TIMES, CHANNEL, NOISE = 4, 20, 0.01
 ANTENNA = 3
 """Place among the eight antennas."""

@@ -160,10 +160,6 @@ def test_what_a_run_is_filling_is_not_deleted_as_left_over(store, capsys, monkey
         monkeypatch.setattr("calstudy.run.store.time.time", lambda: later)
         assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h") == (0, "")
         assert folder.is_dir()
-    # Nor is one that is smaller than asked for.
-    (store.root / "number" / f".building-{KEY}-ab").mkdir()
-    assert run_command(capsys, "store", store.root, "--delete", "--older-than", "1h", "--larger-than", "1MB") == (0, "")
-    assert [item.key for item in leftovers(store)] == [KEY]
 
 
 def test_leftovers_of_publishing_are_removed_from_run_folders(tmp_path):

@@ -206,7 +206,7 @@ def test_the_same_sweep_reads_back_from_its_run_folder(swept):
 @pytest.mark.parametrize("scale", [None, "small"])
 def test_the_shipped_sweep_varies_what_the_paper_says_loss_depends_on(scale):
     family = Sweep.of(load(Path(__file__).parents[2] / "experiments" / "signalloss.yaml", scale))
-    varied = {field for point in family.points for field in point.changes}
+    varied = {field for changes in family.points.values() for field in changes}
     assert varied >= {
         "calibration.basis.buffer",
         "instrument.channels.count",
@@ -305,16 +305,16 @@ def test_a_file_with_a_sweep_is_a_sweep_and_one_without_is_none(folder):
 def test_blocks_as_values_vary_fields_together(folder):
     sweep = {"instrument.channels": [{"first": "170 MHz", "width": "200 kHz", "count": 64}]}
     family = Sweep.of(validate({**small(folder), "sweep": sweep}, folder))
-    (point,) = family.points
-    assert family.members[point.label].instrument.channels.count == 64
-    assert point.changes == {"instrument.channels": "first 170 MHz, width 200 kHz, count 64"}
-    assert point.label == "01-channels=first170MHzwidth200kHzcount64"
+    ((label, changes),) = family.points.items()
+    assert family.members[label].instrument.channels.count == 64
+    assert changes == {"instrument.channels": "first 170 MHz, width 200 kHz, count 64"}
+    assert label == "01-channels=first170MHzwidth200kHzcount64"
 
 
 def test_blocks_may_have_a_point_in_common(folder):
     sweep = [{"sky.eor.seed": [2, 12]}, {"corruption.noise.factor": [2, 3]}]
     family = Sweep.of(validate({**small(folder), "sweep": sweep}, folder))
-    first, third = (family.members[family.points[place].label] for place in (0, 2))
+    first, third = (family.members[list(family.points)[place]] for place in (0, 2))
     assert (first.sky.eor.seed, first.corruption) == (third.sky.eor.seed, third.corruption)
 
 

@@ -69,9 +69,10 @@ def test_a_step_that_cannot_be_measured_fails_alone(monkeypatch, capsys):
         'return {"number": 1.0}': "its measure returned a dict, expected Findings",
     }
     files = [step("0.0", 0.5), *(step(f"{number}.0", 0.5, body) for number, body in enumerate(broken, 1))]
-    status, out, _ = validate(monkeypatch, capsys, *files, "--json")
+    status, out, _ = validate(monkeypatch, capsys, *files)
     assert status == 1
-    verdicts = {item["name"].partition(" ")[0]: item for item in json.loads(out)}
+    folder = Path(re.search(r"results: (.+)", out)[1])
+    verdicts = {item["name"].partition(" ")[0]: item for item in json.loads((folder / "claims.json").read_text())}
     assert {name for name, verdict in verdicts.items() if verdict["verdict"] == "PASS"} == {"0.0"}
     for number, reason in enumerate(broken.values(), 1):
         assert reason in verdicts[f"{number}.0"]["reason"]

@@ -68,9 +68,8 @@ class CollectionFile(Section):
     @model_validator(mode="after")
     def _names_no_one_twice(self) -> CollectionFile:
         names = [member.name for member in self.experiments if member.name]
-        for name in names:
-            if names.count(name) > 1:
-                raise fault("experiments", f"gives the name {name!r} twice")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise fault("experiments", f"gives the name {twice[0]!r} twice")
         return self
 
 
@@ -112,30 +111,29 @@ class Collection(Family):
     def with_finished(self, folders: Sequence[Path], console: Console, *, planned: bool = False) -> Self:
         """Return the collection with members taken from finished runs of the same studies.
 
-        The tables of such a member are put into the store, and it is not run again. The console shows the run of each
-        member, and the reason why a run of its name is not used. With `planned`, the store does not change. Raises
-        InputError if no member is found, the store has other results of a member, or it cannot be written.
+        The tables of such a member are put into the store, unless this is only `planned`, and it is not run again.
+        Raises InputError if no member is found, the store has other results of a member, or it cannot be written.
         """
         runs, store = find_finished(folders), Store(self.outputs.store)
-        taken: dict[str, tuple[FinishedRun, list[Task]]] = {}
+        taken: dict[str, FinishedRun] = {}
         for name, study in self.studies.items():
             if (reason := _needs_more(self, name, study)) is not None:
                 console.print(f"{name}: will be run ({reason})", markup=False)
                 continue
             if (run := _choose(name, study, runs, console)) is not None:
-                taken[name] = run, study.tables
+                taken[name] = run
         if not taken:
             given = ", ".join(str(folder) for folder in folders)
             members = ", ".join(self.members)
             raise InputError(f"--finished {given}: no finished run of a member is there (members: {members})")
-        for run, tables in taken.values():
-            for task in tables:
+        for name, run in taken.items():
+            for task in self.studies[name].tables:
                 there = store.verify(task.stage.name, task.key)
                 if there is not None:
-                    _require_same(there, run.tables[task.key]["files"], run, store)
+                    _require_same(there, run.entries[task.key]["files"], run, store)
                 elif not planned:
                     _put(task, run, store)
-        return replace(self, finished={**self.finished, **{name: run.folder for name, (run, _) in taken.items()}})
+        return replace(self, finished={**self.finished, **{name: run.path for name, run in taken.items()}})
 
     def member(self, label: str) -> ExperimentStudy:
         """Return the study of a member, which may have realizations."""
@@ -173,8 +171,7 @@ class Collection(Family):
         return [self._figure(figure) for figure in figures_for("collection", self.file.figures, "figures")]
 
     def _figure(self, figure: StudyFigure) -> Task:
-        shown = figure.roles(self.roles)
-        compared = {role: self.studies[self.roles[role]] for role in shown} or dict(self.studies)
+        compared = {role: self.studies[self.roles[role]] for role in figure.roles(self.roles)} or dict(self.studies)
         notes = unique_notes(note for study in compared.values() for note in study.stand_ins)
         return figure_task(figure, {label: study.graph for label, study in compared.items()}, notes)
 
@@ -232,14 +229,14 @@ def _load_members(content: CollectionFile, file: StudyFile) -> dict[str, Experim
     if faults:
         raise ExperimentError(faults)
     first, *others = members.values()
-    for experiment, name in itertools.product(others, ("store", "runs")):
-        if getattr(experiment.outputs, name) != getattr(first.outputs, name):
-            raise ExperimentError(
-                [
-                    f"experiments: {experiment.name} and {first.name} have different outputs.{name}; members "
-                    f"share one (--set outputs.{name}=DIR sets it for all)"
-                ]
-            )
+    faults = [
+        f"experiments: {experiment.name} and {first.name} have different outputs.{name}; members share one "
+        f"(--set outputs.{name}=DIR sets it for all)"
+        for experiment, name in itertools.product(others, ("store", "runs"))
+        if getattr(experiment.outputs, name) != getattr(first.outputs, name)
+    ]
+    if faults:
+        raise ExperimentError(faults[:1])
     return members
 
 
@@ -276,75 +273,60 @@ def _roles(file: CollectionFile, members: Mapping[str, Experiment]) -> dict[str,
 TABLES = "tables"
 
 
-@dataclass(frozen=True)
-class FinishedRun:
-    """A finished run, or a reference with its tables.
+class FinishedRun(RunFolder):
+    """A finished run, or a reference with its tables."""
 
-    The folder has ``manifest.json``, whose content is `manifest`, and ``tables/``. `tables` are the manifest's
-    entries, by key, of the products that these are made of.
-    """
+    @cached_property
+    def entries(self) -> dict[str, Mapping[str, Any]]:
+        """The manifest's entries, by key, of the products whose files are the tables."""
+        return {entry["key"]: entry for entry in self.products if isinstance(entry.get("files"), dict)}
 
-    folder: Path
-    manifest: Mapping[str, Any]
-    tables: Mapping[str, Mapping[str, Any]]
-
-    @property
-    def described(self) -> str:
-        """The folder, and the time when the run finished."""
-        return f"{self.folder} (finished {self.manifest.get('finished', 'at an unknown time')})"
+    def is_readable(self) -> bool:
+        """Return whether the manifest is that of a run."""
+        try:
+            return self.entries is not None
+        except (InputError, KeyError, TypeError, AttributeError):
+            return False
 
     def refusal(self, study: ExperimentStudy) -> str | None:
         """Return why a study cannot be taken from this run, or None if its tables are present and unchanged."""
-        if not self.tables:
+        if not self.entries:
             return (
                 "its manifest does not list the files of its tables: it is of an older version, or not of an experiment"
             )
-        if not all(task.key in self.tables for task in study.tables):
+        if not all(task.key in self.entries for task in study.tables):
             return "its tables are of other settings, or another version of a stage"
         for task in study.tables:
-            for name, digest in self.tables[task.key]["files"].items():
-                path = self.folder / TABLES / name
+            for name, digest in self.entries[task.key]["files"].items():
+                path = self.path / TABLES / name
                 if Path(name).name != name or not path.is_file() or sha256(path) != digest:
                     return f"{TABLES}/{name} is not what the run wrote: it was changed or lost"
         return None
 
 
 def find_finished(folders: Sequence[Path]) -> list[FinishedRun]:
-    """Return the readable finished runs among these folders and directly below them.
-
-    Raises InputError if a folder neither is one nor contains any.
-    """
+    """Return the readable runs among folders and directly below; raises InputError if one is none and has none."""
     found = []
     for folder in folders:
-        inside = (
-            [folder] if (folder / MANIFEST).is_file() else sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
-        )
-        runs = [run for path in inside if (run := _read(path)) is not None]
+        inside = [folder / MANIFEST] if (folder / MANIFEST).is_file() else sorted(folder.glob(f"*/{MANIFEST}"))
+        runs = [run for run in (FinishedRun(path.parent) for path in inside) if run.is_readable()]
         if not runs:
             raise InputError(f"--finished {folder}: is not the folder of a finished run, and holds none")
         found += runs
     return found
 
 
-def _read(folder: Path) -> FinishedRun | None:
-    run = RunFolder(folder)
-    try:
-        tables = {entry["key"]: entry for entry in run.products if isinstance(entry.get("files"), dict)}
-    except (InputError, KeyError, TypeError, AttributeError):
-        return None
-    return FinishedRun(folder, run.manifest, tables)
-
-
 def _choose(name: str, study: ExperimentStudy, runs: Sequence[FinishedRun], console: Console) -> FinishedRun | None:
     """Return the run that a member is taken from, or None; print the choice, or the reasons against it."""
-    refusals = {run.folder: run.refusal(study) for run in runs}
-    for run in runs:
-        if refusals[run.folder] is None:
-            console.print(f"{name}: taken from {run.described}", markup=False)
-            return run
-    for other in runs:
-        if other.manifest.get("name") == name:
-            console.print(f"{name}: {other.folder} is left out; {refusals[other.folder]}", markup=False)
+    refusals = [run.refusal(study) for run in runs]
+    if None in refusals:
+        chosen = runs[refusals.index(None)]
+        finished = chosen.manifest.get("finished", "at an unknown time")
+        console.print(f"{name}: taken from {chosen.path} (finished {finished})", markup=False)
+        return chosen
+    for other, refusal in zip(runs, refusals, strict=True):
+        if other.name == name:
+            console.print(f"{name}: {other.path} is left out; {refusal}", markup=False)
     console.print(f"{name}: will be run", markup=False)
     return None
 
@@ -364,16 +346,15 @@ def _needs_more(collection: Collection, name: str, study: ExperimentStudy) -> st
 
 def _put(task: Task, run: FinishedRun, store: Store) -> None:
     """Put a table of a run into a store, under the key of its product."""
-    entry, stage = run.tables[task.key], task.stage.name
+    entry, stage = run.entries[task.key], task.stage.name
     store.prepare()
     unwritten = errors_of_files(f"outputs.store = {str(store.root)!r}: cannot be written")
     with store.lock(stage, task.key), store.building(stage, task.key) as folder, unwritten:
         for name in entry["files"]:
-            shutil.copyfile(run.folder / TABLES / name, folder / name)
+            shutil.copyfile(run.path / TABLES / name, folder / name)
         kept = {key: value for key, value in entry.items() if key not in ("files", "made_by_this_run")}
-        record = {"lineage": "", **kept}
         origin = {key: run.manifest.get(key) for key in ("name", "finished", "git_commit")}
-        store.seal(folder, {**record, "stage": stage, "temporary": False, "from_run": origin})
+        store.seal(folder, {"lineage": "", **kept, "stage": stage, "temporary": False, "from_run": origin})
 
 
 def _require_same(there: Product, files: Mapping[str, str], run: FinishedRun, store: Store) -> None:
@@ -382,6 +363,6 @@ def _require_same(there: Product, files: Mapping[str, str], run: FinishedRun, st
     other = next((name for name in {**files, **found} if files.get(name) != found.get(name)), None)
     if other is not None:
         raise InputError(
-            f"--finished {run.folder}: {TABLES}/{other} differs from that of the same study in the store {store.root}; "
+            f"--finished {run.path}: {TABLES}/{other} differs from that of the same study in the store {store.root}; "
             "leave this folder out to use the store, or use another store with --set outputs.store=DIR"
         )

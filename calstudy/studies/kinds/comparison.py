@@ -155,10 +155,7 @@ class ComparisonFile(Section):
 
 @dataclass(frozen=True)
 class Case:
-    """One calibrator in one world.
-
-    The refusal is the reason why the calibrator cannot work there; it is empty if it can.
-    """
+    """One calibrator in one world, with the reason, which may be empty, why it cannot work there."""
 
     calibrator: str
     world: str
@@ -189,9 +186,8 @@ class _CaseStudy(ExperimentStudy):
 class Comparison(Family):
     """Calibrators in worlds, without those that cannot work in a world, for which the table has the reason.
 
-    Members are the experiments of all cases by `case_name`, ordered by world and then by calibrator, as in the file.
-    `refusals` has the reason of those that cannot work. `resolved` is the file with its experiment in it, and with all
-    changes applied.
+    Members are the experiments of all cases by `case_name`, ordered by world and then by calibrator. `refusals` has the
+    reason of those that cannot work. `resolved` is the file with its experiment in it, and with all changes applied.
     """
 
     key = "calibrators"
@@ -213,8 +209,7 @@ class Comparison(Family):
 
         Its scale is in the `scales` of the file, of the experiment, or of both. Overrides that begin with a key of
         `OWN` change the file, such as ``worlds={ideal: {}}`` or ``calibrators.redcal.max_steps=50``; all others are
-        applied to the experiment of every case. Raises InputError if a file cannot be read, or a scale or override
-        cannot be applied, and ExperimentError if fields are unknown, missing, or have values that are not allowed.
+        applied to the experiment of every case. Errors are as for `calstudy.studies.load.load_study`.
         """
         content, base, overrides, worlds = _read(file, calibrators)
         members = _experiments(content, worlds, base, lambda data: validate(data, file.folder))
@@ -283,9 +278,8 @@ class Comparison(Family):
     def notes(self) -> tuple[str, ...]:
         """The notes of the cases, and which calibrators cannot work where."""
         worlds: dict[tuple[str, str], list[str]] = {}
-        for case in self.cases:
-            if case.refusal:
-                worlds.setdefault((case.calibrator, case.refusal), []).append(case.world)
+        for world, calibrator, reason in self.refused:
+            worlds.setdefault((calibrator, reason), []).append(world)
         count = len(self.file.worlds)
         refused = (
             f"{calibrator} cannot work in {'any world' if len(found) == count else ', '.join(found)}: {reason}"
@@ -294,25 +288,25 @@ class Comparison(Family):
         return (*super().notes, *self._left_out, *refused)
 
     @cached_property
-    def _left_out(self) -> tuple[str, ...]:
+    def _left_out(self) -> list[str]:
         """A note for settings of the calibration in the file of the experiment that no case has."""
         source = self.file.experiment
         given = read_mapping(source).get("calibration") if isinstance(source, Path) else None
-        if not isinstance(source, Path) or not isinstance(given, Mapping):
-            return ()
-        changed = self.resolved["overrides"]
-        lost = [field for field in given if field not in OF_CALIBRATORS and f"calibration.{field}" not in changed]
-        named = f"calibration.{', '.join(lost)} of {source.name}"
-        return (f"{named} is not that of the calibrators; for all of them, set it in overrides",) if lost else ()
+        known = (*OF_CALIBRATORS, *(path.removeprefix("calibration.") for path in self.resolved["overrides"]))
+        lost = [field for field in given if field not in known] if isinstance(given, Mapping) else []
+        named = f"calibration.{', '.join(lost)} of {Path(source).name}" if lost else ""
+        return [f"{named} is not that of the calibrators; for all of them, set it in overrides"] if lost else []
+
+    @property
+    def refused(self) -> list[tuple[str, str, str]]:
+        """World, calibrator and reason of the cases that are refused."""
+        return [(case.world, case.calibrator, case.refusal) for case in self.cases if case.refusal]
 
     @property
     def _labels(self) -> dict[str, Any]:
-        """Labels of calibrators and worlds, and refusals: world, calibrator and reason."""
-        return {
-            "calibrators": list(self.file.calibrators),
-            "worlds": list(self.file.worlds),
-            "refusals": [[case.world, case.calibrator, case.refusal] for case in self.cases if case.refusal],
-        }
+        """Labels of calibrators and worlds, and refusals."""
+        file = self.file
+        return {"calibrators": list(file.calibrators), "worlds": list(file.worlds), "refusals": self.refused}
 
     @cached_property
     def scores(self) -> dict[str, MeasureScore]:
@@ -354,15 +348,14 @@ class Comparison(Family):
     def entries(self) -> Mapping[str, Any]:
         """The files of the experiments of the cases, and the refusals."""
         files = {case.title: name for name, case in self._files.items()}
-        return {"cases": files, "refusals": self._labels["refusals"]}
+        return {"cases": files, "refusals": self.refused}
 
 
 @dataclass(frozen=True)
 class WorldData:
-    """The tasks of the exported products of one experiment, which calibrates data with the EoR and without.
+    """The tasks of the exported products of one experiment; the salt of a blind challenge may be empty.
 
-    Data sets are in the order of their digests, which does not reveal their content. The sky model is None if the
-    calibrator has none, and so is the level of noise if there is none; the salt of a blind challenge may be empty.
+    Data sets are in the order of their digests, which does not reveal their content.
     """
 
     experiment: Experiment
@@ -376,18 +369,11 @@ class WorldData:
         """Return the exported products of an experiment."""
         graph = Graph(experiment)
         variants = [experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS[:2]]
-        data = {
-            task.key: task
-            for task in (corruption.data(graph, variant, parity) for variant in variants for parity in PARITIES)
-        }
+        found = [corruption.data(graph, variant, parity) for variant in variants for parity in PARITIES]
+        data = sorted({task.key: task for task in found}.values(), key=lambda task: salted(task.key, salt))
         noisy = any("noise" in variant.components for variant in variants)
-        return cls(
-            experiment,
-            tuple(data[key] for key in sorted(data, key=lambda key: salted(key, salt))),
-            sky_model.sky_model(graph),
-            corruption.noise_level(graph, variants[0]) if noisy else None,
-            salt,
-        )
+        noise_level = corruption.noise_level(graph, variants[0]) if noisy else None
+        return cls(experiment, tuple(data), sky_model.sky_model(graph), noise_level, salt)
 
     @property
     def digest(self) -> str:
@@ -407,8 +393,7 @@ def load_worlds(
     """Return calibrators in the worlds of a comparison, or in the one of an experiment.
 
     `calibrators` are blocks `calibration` by label, in place of those of the file, with the assumptions of the
-    experiment. None is for the file's own; that of an experiment has its own name as label. Raises InputError if the
-    file is neither, or cannot be used.
+    experiment. Raises InputError if the file is neither, or cannot be used.
     """
     file = StudyFile.open(path, scale, overrides)
     kind = kind_of(file.content, file.folder)
@@ -422,8 +407,7 @@ def load_worlds(
             f"{file.path}: has the key {kind.key or KINDS.tag!r}; a single experiment or a comparison is needed"
         )
     plain = experiment.model_dump(mode="json")
-    own = plain["calibration"]
-    blocks = {experiment.calibration.label[:LONGEST_LABEL]: own} if calibrators is None else calibrators
+    blocks = calibrators or {experiment.calibration.label[:LONGEST_LABEL]: plain["calibration"]}
     content = {
         "name": experiment.name,
         "description": experiment.description,
@@ -435,10 +419,7 @@ def load_worlds(
 
 
 def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
-    """Return a comparison's content with one of its own keys, an entry by its label, or a field of it changed.
-
-    Labels may contain dots. Fields of a world are dotted paths themselves.
-    """
+    """Return a comparison's content with one of its own keys, an entry by its label, or a field of it changed."""
     key, _, rest = path.partition(".")
     if not rest:
         return {**data, key: value}
@@ -446,21 +427,16 @@ def _changed(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     if key not in ("calibrators", "worlds") or not isinstance(entries, Mapping):
         raise InputError(f"--set {path}: set {key} as a whole")
     label = max((known for known in entries if f"{rest}.".startswith(f"{known}.")), key=len, default=rest)
-    field, entry = rest[len(label) + 1 :], entries.get(label)
-    if field and isinstance(entry, str):
-        entry = {CALIBRATORS.tag: entry}
-    if field:
-        value = {**(entry or {}), field: value} if key == "worlds" else override(entry or {}, field, value)
+    if field := rest[len(label) + 1 :]:
+        entry = _block(entries.get(label)) or {}
+        value = {**entry, field: value} if key == "worlds" else override(entry, field, value)
     return {**data, key: {**entries, label: value}}
 
 
 def _with_changes(
     content: ComparisonFile, changes: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the overrides and the worlds of a comparison with changes of --set, which come after both.
-
-    Raises InputError for a change that no case may have.
-    """
+    """Return the overrides and the worlds of a comparison with changes of --set, which come after both."""
     overrides = dict(content.overrides)
     worlds = {world: dict(fields) for world, fields in content.worlds.items()}
     for path, value in changes.items():
@@ -522,10 +498,7 @@ def _read(
 
 
 def _base(content: ComparisonFile, file: StudyFile, optional: bool) -> dict[str, Any]:
-    """Return the experiment from which all cases are made; relative paths start at the folder of the comparison.
-
-    If `optional`, the experiment may lack the scale, because the comparison has it.
-    """
+    """Return the experiment from which all cases are made; it may lack the scale if that is `optional`."""
     scale, folder = file.scale, file.folder
     if isinstance(content.experiment, dict):
         base: dict[str, Any] = content.experiment

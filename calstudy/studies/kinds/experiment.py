@@ -34,9 +34,6 @@ from calstudy.studies.capacity import fit, require_data_fit
 from calstudy.studies.preflight import frame_of, notes_of, require_possible
 from calstudy.studies.study import KINDS, Study
 
-SKY_MODEL_TABLE = "sky-model.csv"
-AS_BUILT_TABLE = "as-built.csv"
-
 
 class ExperimentStudy(Study):
     """One validated experiment; `folder` is its run folder if another study decides it."""
@@ -127,12 +124,17 @@ class ExperimentStudy(Study):
 
     @property
     def texts(self) -> dict[str, str]:
-        """The resolved experiment, the assumptions of the calibrator, and deviations of antennas."""
+        """The resolved experiment, false assumptions of the calibrator below its sky model, deviations of antennas."""
         found = dict(super().texts)
         if self.experiment.calibrates:
-            found[f"tables/{SKY_MODEL_TABLE}"] = self._sky_model_table()
-        if self.experiment.instrument.as_built.note:
-            found[f"tables/{AS_BUILT_TABLE}"] = self._as_built_table()
+            table = Table(("field", "true", "assumed"), sky_model.differences(self.graph))
+            found["tables/sky-model.csv"] = f"# sky model: {sky_model.described(self.graph)}\n{table.csv()}"
+        instrument = self.experiment.instrument
+        if instrument.as_built.note:
+            numbers = make_layout(instrument.layout).numbers
+            deviations = as_built_rows(instrument.as_built, len(numbers))
+            rows = [(number, *row) for number, row in zip(numbers, deviations, strict=True)]
+            found["tables/as-built.csv"] = Table(("number", *COLUMNS), rows).csv()
         return found
 
     @property
@@ -141,26 +143,12 @@ class ExperimentStudy(Study):
         described = {"sky_model": sky_model.described(self.graph)} if self.experiment.calibrates else {}
         return {**described, "seeds": seeds(self.experiment.model_dump(mode="json"))}
 
-    def _as_built_table(self) -> str:
-        """Return as CSV the deviations of each antenna from the nominal instrument."""
-        instrument = self.experiment.instrument
-        numbers = make_layout(instrument.layout).numbers
-        found = as_built_rows(instrument.as_built, len(numbers))
-        rows = [(number, *row) for number, row in zip(numbers, found, strict=True)]
-        return Table(("number", *COLUMNS), rows).csv()
-
-    def _sky_model_table(self) -> str:
-        """Return as CSV the false assumptions of the calibrator, after a line that describes its sky model."""
-        table = Table(("field", "true", "assumed"), sky_model.differences(self.graph))
-        return f"# sky model: {sky_model.described(self.graph)}\n{table.csv()}"
-
 
 @dataclass(frozen=True, eq=False)
 class Family(Study):
-    """Several experiments, and the figures, tables and claims of all of them.
+    """Several experiments by label, all with the same store and folder of runs, and the results of all of them.
 
-    Members are the experiments by label, all with the same store and folder of runs. Products that several members need
-    have one key, and are made once. If members have their own run folders, they are the `parts` of a family.
+    Products that several members need have one key, and are made once. Members with their own run folders are `parts`.
     """
 
     file: Any
@@ -198,8 +186,7 @@ class Family(Study):
     def content(self) -> Any:
         """The file without scales and outputs, and the names of the run folders of the members."""
         names = [name for name in type(self.file).model_fields if name not in ("scales", "outputs")]
-        reference = KINDS.reference_of(type(self))
-        own = {} if reference in KINDS.built_in() else {KINDS.tag: KINDS.identity(reference)}
+        own = {} if self.is_built_in() else {KINDS.tag: KINDS.identity(KINDS.reference_of(type(self)))}
         return {
             **own,
             "file": {name: identity(getattr(self.file, name)) for name in names},
@@ -231,9 +218,8 @@ class Family(Study):
 
     def draw(self, figure: StudyFigure, settings: Mapping[str, Any] | None = None) -> Task:
         """Return the task of a figure of all members; parameters as for `calstudy.figures.figure_task`."""
-        return figure_task(
-            figure, {label: study.graph for label, study in self.studies.items()}, self.stand_ins, settings
-        )
+        graphs = {label: study.graph for label, study in self.studies.items()}
+        return figure_task(figure, graphs, self.stand_ins, settings)
 
 
 def content_of(file: Any) -> Any:
@@ -249,10 +235,7 @@ def what_is_made(experiment: Experiment) -> Experiment:
 
 
 def study_of(experiment: Experiment, folder: Path = Path()) -> Study:
-    """Return the study of an experiment: of the kind whose key it has, such as `sweep`.
-
-    Relative paths of files in a sweep start at the folder; all others are absolute.
-    """
+    """Return the study of an experiment, of the kind whose key it has; paths in a sweep start at the folder."""
     special = KINDS.marked("key", [name for name, value in experiment if value])
     return (special[0] if special else ExperimentStudy).of(experiment, folder)
 

@@ -21,12 +21,10 @@ from calstudy.studies.kinds.experiment import ExperimentStudy
 
 
 class Realizations(ExperimentStudy):
-    """An experiment whose EoR, gains or noise are drawn several times.
+    """An experiment whose EoR, gains or noise are drawn several times; raises ExperimentError if they cannot be.
 
-    Products that several realizations need have one key, and are made once. The first realization is the experiment
-    itself, and shares its products with the experiment's own run. It is no family of experiments: what is kept are the
-    pooled numbers, and realizations have no folders. Raises ExperimentError with one sentence per fault of the
-    realizations.
+    The first realization is the experiment itself, and shares its products with the experiment's own run. It is no
+    family of experiments: what is kept are the pooled numbers, and realizations have no folders.
     """
 
     key = "realizations"

@@ -150,10 +150,7 @@ class RuntimeStudy(Study):
 
     @cached_property
     def timed_on(self) -> Mapping[str, Any]:
-        """The machine and versions of packages, part of the keys, so that other machines' measurements are not reused.
-
-        Raises InputError if TensorFlow is not installed, or the file wants a GPU and this machine has none.
-        """
+        """The machine and versions of packages, part of the keys; InputError without TensorFlow or a GPU asked for."""
         require_tensorflow()
         versions = package_versions()
         found = {**machine(), **{name: versions[name] for name in TIMED_WITH}}
@@ -180,12 +177,8 @@ class RuntimeStudy(Study):
 
     def _rows(self, antennas: int) -> TimedArray:
         settings = self.file.runtime
-        layout = RectangularLayout(
-            kind="rectangular",
-            count=antennas,
-            spacing=f"{settings.rows.spacing!r} m",
-            max_baseline=f"{settings.rows.max_baseline!r} m",
-        )
+        spacing, longest = f"{settings.rows.spacing!r} m", f"{settings.rows.max_baseline!r} m"
+        layout = RectangularLayout(kind="rectangular", count=antennas, spacing=spacing, max_baseline=longest)
         return TimedArray(layout=layout, channels=settings.channels, basis=settings.basis)
 
     def _line(self, length: float) -> TimedArray:
@@ -210,15 +203,16 @@ class RuntimeStudy(Study):
 
     def _timing(self, name: str, device: str) -> TimeSteps:
         panel, size, array = self.arrays[name]
-        label = f"{size:g} antennas" if panel == "rows" else f"line of {size:g} m"
+        settings = self.file.runtime
+        rows = panel == "rows"
         return TimeSteps(
-            f"{label}, {device}",
+            f"{size:g} antennas, {device}" if rows else f"line of {size:g} m, {device}",
             machine=self.timed_on,
             panel=panel,
             size=size,
-            longest=self.file.runtime.rows.max_baseline if panel == "rows" else size,
+            longest=settings.rows.max_baseline if rows else size,
             array=array,
-            samples=self.file.runtime.samples.model_dump(mode="json"),
+            samples=settings.samples.model_dump(mode="json"),
             device=device,
         )
 
@@ -241,12 +235,11 @@ class RuntimeStudy(Study):
     @cached_property
     def figures(self) -> list[Task]:
         """Time per step against the number of antennas, and against the longest baseline."""
-        return [self._figure(panel) for panel in PANELS]
-
-    def _figure(self, panel: str) -> Task:
-        figure = FIGURES.make({"kind": "runtime", "panel": panel})
-        shown = {name: task for name, task in self.timings.items() if task.panel == panel}
-        return draw_task(figure, shown, self.stand_ins, {})
+        figures = []
+        for panel in PANELS:
+            shown = {name: task for name, task in self.timings.items() if task.panel == panel}
+            figures.append(draw_task(FIGURES.make({"kind": "runtime", "panel": panel}), shown, self.stand_ins, {}))
+        return figures
 
     @cached_property
     def claims(self) -> Task | None:

@@ -33,23 +33,12 @@ POINTS = "points"
 """Folder of the points in the run folder."""
 
 
-@dataclass(frozen=True)
-class Point:
-    """One experiment of a sweep.
-
-    The label, which names its folder, has its number and the changes: the varied fields (dotted path) and their
-    values as text, as written in the file.
-    """
-
-    label: str
-    changes: Mapping[str, str]
-
-
 @dataclass(frozen=True, eq=False)
 class Sweep(Family):
     """A family of experiments that differ in a few fields of `file`; members have the labels of the points.
 
-    A block of the file's `sweep` has all combinations of its values as points, with the last field varying fastest.
+    A block of the file's `sweep` has all combinations of its values as points, with the last field varying fastest:
+    the changed fields (dotted path) with their values as text, by labels that name the folders.
     """
 
     key = "sweep"
@@ -57,7 +46,7 @@ class Sweep(Family):
     subfolders = (POINTS,)
     has_reference = False
 
-    blocks: Sequence[Sequence[Point]]
+    blocks: Sequence[Mapping[str, Mapping[str, str]]]
 
     @classmethod
     def load(cls, file: StudyFile) -> Sweep:
@@ -66,11 +55,7 @@ class Sweep(Family):
 
     @classmethod
     def of(cls, experiment: Experiment, folder: Path = Path()) -> Sweep:
-        """Return the family of an experiment with a `sweep`, whose relative paths of files start at a folder.
-
-        Raises ExperimentError with one sentence per fault: a field that cannot be varied, is unknown, or does not take
-        a value, a point whose fields do not go together, or points of a block that are the same.
-        """
+        """Return the family of an experiment with a `sweep`; raises ExperimentError with one sentence per fault."""
         if not experiment.sweep:
             raise InputError(f"{experiment.name}: has no sweep, and so is no family of experiments")
         faults = _faults(experiment)
@@ -86,15 +71,15 @@ class Sweep(Family):
             raise ExperimentError(faults)
         swept = with_absolute_paths(experiment.sweep, experiments, folder)
         numbers = itertools.count(1)
-        blocks = [tuple(_point(next(numbers), changes, block) for changes in _combinations(block)) for block in swept]
-        labels = (point.label for block in blocks for point in block)
+        blocks = [dict(_point(next(numbers), changes, block) for changes in _combinations(block)) for block in swept]
+        labels = (label for block in blocks for label in block)
         members = dict(zip(labels, experiments, strict=True))
         return cls(experiment.model_copy(update={"sweep": swept}), members, blocks)
 
     @property
-    def points(self) -> tuple[Point, ...]:
-        """The points of all blocks."""
-        return tuple(point for block in self.blocks for point in block)
+    def points(self) -> dict[str, Mapping[str, str]]:
+        """The changes of the points of all blocks, by label."""
+        return {label: changes for block in self.blocks for label, changes in block.items()}
 
     def member(self, label: str) -> ExperimentStudy:
         """Return the study of a point, with a folder under ``points``."""
@@ -118,7 +103,7 @@ class Sweep(Family):
     @cached_property
     def figures(self) -> list[Task]:
         """The signal loss of all points."""
-        blocks = [[{"label": point.label, "changes": dict(point.changes)} for point in block] for block in self.blocks]
+        blocks = [[{"label": label, "changes": changes} for label, changes in block.items()] for block in self.blocks]
         return [self.draw(FIGURES.make("sweep"), {"blocks": blocks})]
 
     @cached_property
@@ -137,9 +122,7 @@ class Sweep(Family):
     @property
     def entries(self) -> Mapping[str, Any]:
         """The folder and the changes of every point."""
-        return {
-            POINTS: [{"folder": f"{POINTS}/{point.label}", "changes": dict(point.changes)} for point in self.points]
-        }
+        return {POINTS: [{"folder": f"{POINTS}/{label}", "changes": point} for label, point in self.points.items()]}
 
 
 def _experiments(
@@ -171,11 +154,12 @@ def _combinations(block: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(block, values, strict=True)) for values in itertools.product(*block.values())]
 
 
-def _point(number: int, changes: Mapping[str, Any], block: Mapping[str, Sequence[Any]]) -> Point:
-    """Return the point with a label of the fields that have several values, of the first field if none has."""
+def _point(number: int, changes: Mapping[str, Any], block: Mapping[str, Sequence[Any]]) -> tuple[str, dict[str, str]]:
+    """Return a label of the fields that have several values, or of the first one, and the changes as text."""
     varied = [path for path, values in block.items() if len(values) > 1] or list(block)[:1]
-    named = {path: changes[path] for path in varied}
-    return Point(_label(number, named), {path: text_of(value) for path, value in changes.items()})
+    texts, names = {path: text_of(value) for path, value in changes.items()}, short_names(varied)
+    words = "-".join(f"{names[path]}={texts[path]}" for path in varied)
+    return f"{number:02d}-{re.sub(r'[^A-Za-z0-9_.=+-]+', '', words)}"[:LONGEST_LABEL], texts
 
 
 def _faults(experiment: Experiment) -> list[str]:
@@ -202,9 +186,3 @@ def _faults(experiment: Experiment) -> list[str]:
             f"sweep: compares the signal loss of its points, which needs the variants {', '.join(SIGNAL_LOSS_VARIANTS)}"
         )
     return faults
-
-
-def _label(number: int, changes: Mapping[str, Any]) -> str:
-    names = short_names(list(changes))
-    words = "-".join(f"{names[path]}={text_of(value)}" for path, value in changes.items())
-    return f"{number:02d}-{re.sub(r'[^A-Za-z0-9_.=+-]+', '', words)}"[:LONGEST_LABEL]
