@@ -10,7 +10,7 @@ import re
 import shutil
 import socket
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from graphlib import TopologicalSorter
@@ -289,11 +289,10 @@ def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
 def schedule(
     targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False, quick: bool = False
 ) -> Schedule:
-    """Find the tasks to make: the targets and all that they need, unless the store has them intact.
+    """Find the tasks to make: the targets and all that they need, but those intact in the store, or with `given` keys.
 
-    A kept product without an intact record is made again even if nothing else has to be made from it. Products with
-    keys in `given` are not made. With `strict`, products of other code or other versions of packages are made again.
-    A `quick` look reads no files of products, and misses damaged ones behind what is intact.
+    Those of `without_record` are made again, and with `strict` products of other code or other versions of packages. A
+    `quick` look reads no files of products, and misses damaged ones behind what is intact.
     """
     other: Container[str] = ()
     if strict:
@@ -392,22 +391,17 @@ def _cluster(workers: int) -> LocalCluster:
         os.environ.pop("PYTHONSAFEPATH", None)
 
 
-@contextmanager
-def _client(workers: Workers) -> Iterator[Client]:
+def _client(workers: Workers) -> AbstractContextManager[Client]:
     if workers.scheduler is None:
-        with _local_client(workers.count, workers.log) as client:
-            yield client
-        return
+        return _local_client(workers.count, workers.log)
     from distributed import Client
 
     path = Path(workers.scheduler)
     address = {"scheduler_file": str(path)} if path.is_file() else {"address": workers.scheduler}
     try:
-        client = Client(**address)
+        return Client(**address)
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"--scheduler {workers.scheduler}: cannot connect ({error})") from None
-    with client:
-        yield client
 
 
 def _announce_and_perform(order: WorkOrder) -> Product:
@@ -504,13 +498,11 @@ def _result(future: Future, task: Task, client: Client, workers: Workers) -> Pro
 
 
 class Lifetimes:
-    """Lifetimes of the temporary products of a run: until the last task that needs them is made.
-
-    A product is temporary if all tasks of the targets that make it are; `todo` are the tasks from `schedule`.
-    """
+    """Lifetimes of the products of a run that all of its tasks call temporary: until the last task that needs them."""
 
     def __init__(self, targets: Iterable[Task], todo: Sequence[Task]) -> None:
-        tasks = _all_tasks(targets)
+        # Also different tasks that make the same product.
+        tasks = unique(targets, by=id)
         self._kept = {task.key: task for task in tasks if not task.temporary}
         self._temporary = {task.key: task for task in tasks if task.key not in self._kept}
         self._users = dict.fromkeys(self._temporary, 0)
@@ -537,18 +529,6 @@ class Lifetimes:
         for key in needed:
             self._users[key] -= 1
         return [self._temporary[key] for key in needed if self._users[key] == 0]
-
-
-def _all_tasks(targets: Iterable[Task]) -> list[Task]:
-    """Return targets and all that they need, including different tasks that make the same product."""
-    found: dict[int, Task] = {}
-    waiting = list(targets)
-    while waiting:
-        task = waiting.pop()
-        if id(task) not in found:
-            found[id(task)] = task
-            waiting += task.needs.values()
-    return list(found.values())
 
 
 def largest_disk(targets: Iterable[Task], todo: Sequence[Task]) -> float:
