@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,10 +34,9 @@ TABLES = ("realizations.md", "comparison.md")
 
 @dataclass(frozen=True)
 class Reference:
-    """Figures (arrays by figure and name) and claims of a run or of a reference.
+    """Figures (arrays by figure and name) and claims of a run or of a reference, `on_machines` if of run times.
 
-    `tolerances` are those of the figures that the experiment of a reference names, by label. `on_machines` is true for
-    a reference of run times, which are those of a machine.
+    `tolerances` are those of the figures that the experiment of a reference names, by label.
     """
 
     figures: dict[str, dict[str, np.ndarray]]
@@ -54,15 +54,11 @@ def find_references(folders: Sequence[Path]) -> list[Path]:
     """Return the reference folders among these and directly below; raise InputError for a folder without any."""
     found: list[Path] = []
     for folder in folders:
-        inside = (
-            [folder]
-            if (folder / EXPERIMENT).is_file()
-            else sorted(path.parent for path in folder.glob("*/" + EXPERIMENT))
-        )
+        inside = [*folder.glob(EXPERIMENT)] or sorted(folder.glob(f"*/{EXPERIMENT}"))
         if not inside:
             raise InputError(f"{folder}: holds no reference results (a folder with {EXPERIMENT}, or folders with one)")
-        found += [path for path in inside if path not in found]
-    return found
+        found += [path.parent for path in inside]
+    return list(dict.fromkeys(found))
 
 
 def read_reference(folder: Path) -> Reference:
@@ -72,10 +68,7 @@ def read_reference(folder: Path) -> Reference:
 
 
 def _tolerances(experiment: Mapping[str, Any], folder: Path) -> dict[str, Rules]:
-    """Return the tolerances of the figures that an experiment or a collection names; a collection has them on top.
-
-    A user's figure that no longer exists has none, so that its arrays may not move at all.
-    """
+    """Return the tolerances of the figures that an experiment or a collection names; none of a figure that is gone."""
     named = experiment.get("figures", (experiment.get("outputs") or {}).get("figures"))
     found = {}
     # The default figures, of a study of measured data, are null there; `rules_of` finds their tolerances by name.
@@ -109,10 +102,9 @@ def require_same_study(reference: Path, run: Path) -> None:
 def accept(run: Path, reference: Path) -> None:
     """Make a finished run the reference: its pictures, arrays, tables, claims and description replace the old ones.
 
-    The run may be of an experiment or a collection. Files that the run does not have are removed from the reference
-    folder, which is made if it does not exist. A collection keeps the experiments of its members as they are in the
-    references beside it, by the members' names. Raise InputError if the run is not readable, or the folder cannot be
-    written; the complete run is read before anything is written.
+    A collection keeps the experiments of its members as they are in the references beside it, by the members' names.
+    Raise InputError if the run is not readable, or the folder, which need not exist, cannot be written; the complete
+    run is read before anything is written.
     """
     try:
         manifest = RunFolder(run).manifest
@@ -162,14 +154,14 @@ def _experiment(run: Path) -> dict[str, Any]:
 
 def _without_folders(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return an experiment, or a comparison with one in it, without its store and folder of runs."""
+
+    def kept(block: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+        return {key: value for key, value in block.items() if key not in (f"{above}store", f"{above}runs")}
+
     if isinstance(content.get("experiment"), Mapping):
-        worlds = {
-            world: {path: value for path, value in changes.items() if path not in ("outputs.store", "outputs.runs")}
-            for world, changes in content["worlds"].items()
-        }
+        worlds = {world: kept(changes, "outputs.") for world, changes in content["worlds"].items()}
         return {**content, "experiment": _without_folders(content["experiment"]), "worlds": worlds}
-    outputs = {key: value for key, value in content.get("outputs", {}).items() if key not in ("store", "runs")}
-    return {**content, "outputs": outputs}
+    return {**content, "outputs": kept(content.get("outputs", {}))}
 
 
 def has_results(reference: Path) -> bool:
@@ -195,12 +187,11 @@ CLAIM_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class ArrayComparison:
-    """One array of a figure against its reference.
+    """One array of a figure against its reference: "same" to rounding, "moved" within the tolerance, or "beyond" it.
 
-    `status` is "same" to rounding, "moved" within the tolerance, or "beyond" it. `relative` is the largest difference
-    over the largest magnitude of the reference, None if there is none; `largest`, `rms` and `shift` are in σ, None for
-    arrays that are not drawn (`calstudy.verdicts.tolerances.Drawn`). `why` is the reason of the tolerance. `problem`
-    names a fault other than numbers (another shape, an array that is missing or new), or is empty.
+    `relative` is the largest difference over the largest magnitude of the reference; `largest`, `rms` and `shift` are
+    in σ, None for arrays that are not drawn (`calstudy.verdicts.tolerances.Drawn`). `why` is the reason of the
+    tolerance. `problem` names a fault other than numbers, or is empty.
     """
 
     figure: str
@@ -229,10 +220,9 @@ class ClaimComparison:
 
 
 def rules_of(figure: str, declared: Mapping[str, Rules] | None = None) -> Rules:
-    """Return the tolerances of a figure by its label, the name of its files.
+    """Return the tolerances of a figure by its label: `declared`, or those of the plug-in; an unknown figure has none.
 
-    `declared` are those of the figures that the reference's experiment names, by label. Any other figure is looked up
-    among the built-in and installed ones, where its label may add a word to its name. An unknown figure has none.
+    A label may add a word to the name of a built-in or installed figure.
     """
     if declared and figure in declared:
         return declared[figure]
@@ -244,10 +234,9 @@ def rules_of(figure: str, declared: Mapping[str, Rules] | None = None) -> Rules:
 def compare_figures(
     reference: Mapping[str, Arrays], made: Mapping[str, Arrays], declared: Mapping[str, Rules] | None = None
 ) -> list[ArrayComparison]:
-    """Compare figures, each a mapping of arrays by name, with the reference of the same label.
+    """Compare figures, each a mapping of arrays by name, with the reference of the same label; see `rules_of`.
 
     A figure or array that only the reference has is beyond any tolerance; one that only the new results have, moved.
-    `declared` is as for `rules_of`.
     """
     found = []
     for figure in dict.fromkeys([*reference, *made]):
@@ -324,20 +313,16 @@ def _relative(old: np.ndarray, made: np.ndarray, among: np.ndarray | bool = True
 def _deviations(name: str, old: np.ndarray, made: np.ndarray, sigma: np.ndarray) -> tuple[float, float, float]:
     """Return the largest, rms and mean of a difference in its σ; elements without a finite error bar are left out."""
     usable = np.isfinite(old) & np.isfinite(sigma) & (sigma > 0)
-    difference = made[usable] - old[usable]
-    sigma = sigma[usable]
+    difference, sigma = made[usable] - old[usable], sigma[usable]
+    if not difference.size:
+        return 0.0, 0.0, 0.0
     if name.rpartition(".")[2] == "power":
         difference = difference.real  # The imaginary part of a power estimates nothing.
     elif np.iscomplexobj(difference):
-        difference, sigma = np.concatenate([difference.real, difference.imag]), np.concatenate([sigma, sigma])
-    if not difference.size:
-        return 0.0, 0.0, 0.0
+        difference, sigma = np.concatenate([difference.real, difference.imag]), np.tile(sigma, 2)
     scaled = difference / sigma
-    return (
-        float(np.abs(scaled).max()),
-        float(np.sqrt(np.mean(scaled**2))),
-        float(scaled.mean() * np.sqrt(scaled.size)),
-    )
+    rms, shift = np.sqrt(np.mean(scaled**2)), scaled.mean() * np.sqrt(scaled.size)
+    return float(np.abs(scaled).max()), float(rms), float(shift)
 
 
 def compare_claims(
@@ -345,9 +330,9 @@ def compare_claims(
 ) -> list[ClaimComparison]:
     """Compare claims by name.
 
-    Another verdict is beyond if the number moved by more than three of its uncertainties, or has none; a smaller move
-    is within the scatter of the noise. A claim that was evaluated and now is missing or not evaluated is beyond as
-    well. Numbers of claims about run time and memory (`on_machines`) are never beyond.
+    Another verdict is beyond if the number moved by more than three of its uncertainties, or has none. A claim that was
+    evaluated and now is missing or not evaluated is beyond as well; those about run time and memory (`on_machines`)
+    are never beyond.
     """
     old, new = ({claim.name: claim for claim in claims} for claims in (reference, made))
     names = dict.fromkeys([*old, *new])
@@ -391,8 +376,7 @@ class Regression:
     @property
     def holds(self) -> bool:
         """True if nothing is beyond its tolerance."""
-        statuses = [item.status for item in self.arrays] + [item.status for item in self.claims]
-        return "beyond" not in statuses
+        return "beyond" not in {item.status for item in self.arrays} | {item.status for item in self.claims}
 
 
 def tally(items: Sequence[ArrayComparison | ClaimComparison]) -> str:
@@ -412,10 +396,8 @@ def write_json(regression: Regression, folder: Path) -> Path:
 def show(regression: Regression, console: Console) -> None:
     """Print the count per figure, the arrays that moved and by how much, and the claims that moved."""
     console.print(f"{regression.reference} against {regression.run}", markup=False, highlight=False)
-    for figure in dict.fromkeys(item.figure for item in regression.arrays):
-        console.print(
-            f"  {figure}: {tally([item for item in regression.arrays if item.figure == figure])}", markup=False
-        )
+    for figure, items in groupby(regression.arrays, lambda item: item.figure):
+        console.print(f"  {figure}: {tally(list(items))}", markup=False)
     console.print(f"  claims: {tally(regression.claims) if regression.claims else 'none in the reference'}")
     arrays = list(_listed(regression.arrays))
     if arrays:
@@ -445,10 +427,10 @@ def _number(value: float | None) -> str:
 
 
 def _array_table(items: Sequence[ArrayComparison]) -> Table:
-    rows = []
-    for item in items:
-        deviations = (_number(value) for value in (item.relative, item.largest, item.rms, item.shift))
-        rows.append((f"{item.figure}: {item.name}", item.status, *deviations))
+    rows = [
+        (f"{item.figure}: {item.name}", item.status, *map(_number, (item.relative, item.largest, item.rms, item.shift)))
+        for item in items
+    ]
     return Table(("array", "", "of largest", "largest σ", "rms σ", "mean σ"), rows, "what moved")
 
 

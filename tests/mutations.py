@@ -224,8 +224,8 @@ MUTATIONS = (
     ),
     Mutation(
         "files of others take from other files",
-        "            if not isinstance(link, h5py.HardLink):\n                return",
-        "            if False:\n                return",
+        "        if not isinstance(link, h5py.HardLink):\n            return",
+        "        if False:\n            return",
         ("tests/studies/test_forged_scores.py",),
     ),
     Mutation(

@@ -75,10 +75,8 @@ def refusal_of_disk(error: OSError | RuntimeError) -> str | None:
 
 def error_number(error: OSError | RuntimeError) -> int | None:
     """Return the errno of an error, including HDF5 errors, or None if it has none."""
-    number = getattr(error, "errno", None)
-    if number is None and (found := re.search(r"errno = (\d+)", str(error))):
-        number = int(found[1])
-    return number
+    found = re.search(r"errno = (\d+)", str(error))
+    return getattr(error, "errno", None) or (int(found[1]) if found else None)
 
 
 def nearest(word: object, allowed: list[str]) -> str:

@@ -21,16 +21,11 @@ File = TypeVar("File", "UVCal", "UVData", "UVFlag")
 
 def direction_of_x(telescope: Telescope) -> str | None:
     """Return "east" or "north", where feeds x point and y to the other; None if not known, or for other feeds."""
-    if telescope.feed_array is None:
+    from pyuvdata.utils.pol import get_x_orientation_from_feeds
+
+    if telescope.feed_array is None or not np.isin(telescope.feed_array, ("x", "y")).all():
         return None
-    names, angles = np.asarray(telescope.feed_array), np.asarray(telescope.feed_angle)
-    if not np.isin(names, ("x", "y")).all():
-        return None
-    for direction, of_x in (("east", np.pi / 2), ("north", 0.0)):
-        away = angles - np.where(names == "x", of_x, np.pi / 2 - of_x)
-        if (np.abs((away + np.pi / 2) % np.pi - np.pi / 2) < TOLERANCE).all():
-            return direction
-    return None
+    return get_x_orientation_from_feeds(telescope.feed_array, telescope.feed_angle, tols=(0, TOLERANCE))
 
 
 def x_in_file(data: UVData | UVCal) -> str | None:

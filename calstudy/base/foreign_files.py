@@ -21,13 +21,12 @@ def reason_of(error: Exception) -> str:
     """Return why a library cannot read a file, in one line."""
     if isinstance(error, URLError):
         # From a list that astropy keeps once it has it.
-        return (
-            f"it lacks the location of its telescope, and the list of telescopes could not be fetched: {error.reason}"
-        )
-    lines = str(error).strip().splitlines()
+        missing = "it lacks the location of its telescope, and the list of telescopes could not be fetched"
+        return f"{missing}: {error.reason}"
+    line, *_ = str(error).strip().splitlines() or [""]
     # The message of a missing key is the key alone.
-    kind = f"{type(error).__name__}: " if isinstance(error, LookupError) or not lines else ""
-    return kind + (lines[0] if lines else "no reason given")
+    kind = f"{type(error).__name__}: " if isinstance(error, LookupError) or not line else ""
+    return kind + (line or "no reason given")
 
 
 def require_inside(path: Path, folder: Path) -> None:
@@ -61,19 +60,14 @@ def _foreign(file: h5py.File) -> str | None:
     """Return in words what a file takes from other files, or None."""
     import h5py
 
-    groups, seen = [file["/"]], {hash(file["/"].id)}
-    while groups:
-        group = groups.pop()
-        for name in group:
-            link = group.get(name, getlink=True)
-            if isinstance(link, h5py.SoftLink):
-                continue  # Its target is found as what it is.
-            if not isinstance(link, h5py.HardLink):
-                return f"{group.name.rstrip('/')}/{name} is an external link"
-            item = group[name]
-            if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
-                return f"{item.name} is {'a virtual data set' if item.is_virtual else 'external raw data'}"
-            if isinstance(item, h5py.Group) and hash(item.id) not in seen:
-                seen.add(hash(item.id))
-                groups.append(item)
-    return None
+    def look(name: str, link: object) -> str | None:
+        if isinstance(link, h5py.SoftLink):
+            return None  # Its target is found as what it is.
+        if not isinstance(link, h5py.HardLink):
+            return f"/{name} is an external link"
+        item = file[name]
+        if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+            return f"/{name} is {'a virtual data set' if item.is_virtual else 'external raw data'}"
+        return None
+
+    return file.visititems_links(look)

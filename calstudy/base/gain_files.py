@@ -37,18 +37,11 @@ PARALLEL_HANDS = {"XX": -5, "YY": -6, "RR": -1, "LL": -2}
 class GainTable:
     """Gains with what a file says of their axes, of the convention V_ab = g_a g_b* m_ab of pyuvdata's visibilities.
 
-    Attributes
-    ----------
-    gains : complex, (Nants, Nfreqs, Ntimes, Nfeeds); NaN where there is no solution
-    antennas : names, (Nants,); None: all antennas of the telescope, in the order of their numbers
-    frequencies : Hz, (Nfreqs,); None: the channels of the data; a single one holds for all channels of the data
-    times
-        Julian dates of the start and the end of each solution, (Ntimes, 2); None if they are not known. A single
-        solution holds at all times.
-    feeds : AIPS numbers, (Nfeeds,); None: one gain for all feeds
-    widened
-        Integrations by which `times` are extended on either side, so that the centres of all integrations of a solution
-        are within, and of no other.
+    They are complex, (Nants, Nfreqs, Ntimes, Nfeeds), NaN where there is no solution; a single channel or time holds
+    for all of the data. Without names, antennas are all of the telescope, in the order of their numbers; without
+    frequencies, Hz, channels are those of the data; without AIPS numbers of feeds, one gain is for all. `times` are
+    Julian dates of the start and the end of each solution, (Ntimes, 2), `widened` by so many integrations on either
+    side, so that the centres of all of its integrations are within, and of no other.
     """
 
     gains: np.ndarray
@@ -132,8 +125,7 @@ class GainTable:
                 )
             return numbers
         known = dict(zip(telescope.antenna_names, telescope.antenna_numbers.tolist(), strict=True))
-        unknown = [name for name in self.antennas if name not in known]
-        if unknown:
+        if unknown := [name for name in self.antennas if name not in known]:
             raise InputError(
                 f"the data have no antenna {unknown[0]!r}; their names are {', '.join(list(known)[:3])}, ...; "
                 "antennas must have the same names"
@@ -172,6 +164,8 @@ MAGIC = b"MWAOCAL\0"
 HEADER = struct.Struct("<8s6I2d")
 """Magic, type, structure, numbers of intervals, antennas, channels and polarizations, start and end."""
 H5PARM_AXES = ("ant", "freq", "time", "pol")
+NEUTRAL = {"amplitude000": 1.0, "phase000": 0.0}
+"""Solution tables of H5Parm files, and what stands for one that is missing."""
 
 Reader = Callable[["Path"], GainTable]
 
@@ -180,15 +174,14 @@ def read_gains(path: Path, where: str, template: UVData | UVCal | None = None) -
     """Read gains in any format; `where` names the source of the path in errors.
 
     `template` are the data that the gains are for, or gains for such data; a `GainTable` needs them. Feeds are named
-    as there. Raises InputError if the file does not exist, has none of the formats, takes data from
-    other files, does not fit the template, or is a CASA table and the package that reads it is missing.
+    as there. Raises InputError if the file cannot be read or does not fit the template.
     """
     found = read_gain_file(path, where, None if template is None else x_in_file(template))
     if not isinstance(found, GainTable):
         return found if template is None else with_feeds_of(found, template)
-    if template is None:
-        raise InputError(f"{where} = {str(path)!r}: needs the data that it is for; give a CalH5 file")
     try:
+        if template is None:
+            raise InputError("needs the data that it is for; give a CalH5 file")
         return found.uvcal(template)
     # pyuvdata refuses axes that disagree, such as times that overlap.
     except ValueError as error:
@@ -202,10 +195,9 @@ def read_gain_file(path: Path, where: str, x: str | None = None) -> UVCal | Gain
     """
     from pyuvdata import UVCal
 
-    if path.is_dir() and find_spec("casacore") is None:
-        raise InputError(f"{where} = {str(path)!r}: reading a CASA table takes {CASACORE}")
-    if not path.exists():
-        raise InputError(f"{where} = {str(path)!r}: no such file or folder")
+    missing = f"reading a CASA table takes {CASACORE}" if path.is_dir() else "no such file or folder"
+    if not path.exists() or (path.is_dir() and find_spec("casacore") is None):
+        raise InputError(f"{where} = {str(path)!r}: {missing}")
     require_self_contained(path)
     kind = "CASA table of gains" if path.is_dir() else "file of CalH5, calfits, H5Parm, hyperdrive or calibrate"
     try:
@@ -219,23 +211,17 @@ def read_gain_file(path: Path, where: str, x: str | None = None) -> UVCal | Gain
 
 
 def read_gain_pair(first: Path, second: Path) -> tuple[UVCal, UVCal]:
-    """Read two files of gains to be compared; axes missing in one are taken from the other.
-
-    Raises InputError as `read_gains`.
-    """
-    names = ("the first file", "the second file")
-    found = [read_gain_file(path, name) for path, name in zip((first, second), names, strict=True)]
-    whole = next((cal for cal in found if not isinstance(cal, GainTable)), None)
-    one, other = (read_gains(path, name, whole) for path, name in zip((first, second), names, strict=True))
+    """Read two files of gains to be compared, where axes missing in one are taken from the other; see `read_gains`."""
+    files = ((first, "the first file"), (second, "the second file"))
+    whole = next((cal for cal in (read_gain_file(*file) for file in files) if not isinstance(cal, GainTable)), None)
+    one, other = (read_gains(path, name, whole) for path, name in files)
     return one, other
 
 
 def find_reader(path: Path) -> tuple[str, Reader] | None:
-    """Return the kind of a file, in words, and what reads it, or None if it is none of those here; may raise OSError.
-
-    The readers raise ValueError with a sentence if the file is not as its format demands.
-    """
+    """Return the kind of a file, in words, and what reads it, or raises ValueError; None if none of those here does."""
     import h5py
+    from astropy.io import fits
 
     if path.is_dir():
         return None
@@ -243,8 +229,9 @@ def find_reader(path: Path) -> tuple[str, Reader] | None:
         start = file.read(len(MAGIC))
     if start == MAGIC or path.suffix == ".bin":
         return "file of calibrate", read_mwaocal
-    if start.startswith(b"SIMPLE") and _has_solutions(path):
-        return "file of hyperdrive", read_hyperdrive
+    if start.startswith(b"SIMPLE"):
+        with fits.open(path) as hdus:
+            return ("file of hyperdrive", read_hyperdrive) if "SOLUTIONS" in hdus else None
     if h5py.is_hdf5(path):
         with h5py.File(path) as opened:
             if _solution_sets(opened):
@@ -271,6 +258,7 @@ def read_mwaocal(path: Path) -> GainTable:
 def read_hyperdrive(path: Path) -> GainTable:
     """Read a FITS file of hyperdrive; only the solutions themselves must be there."""
     from astropy.io import fits
+    from astropy.time import Time
 
     with fits.open(path) as hdus:
         values = np.asarray(hdus["SOLUTIONS"].data, float)
@@ -283,10 +271,9 @@ def read_hyperdrive(path: Path) -> GainTable:
     # Columns that hyperdrive does not know are zero or NaN.
     if frequencies is not None and not (np.isfinite(frequencies).all() and (frequencies > 0).all()):
         frequencies = None
-    times = None
-    if start is not None and end is not None:
-        known = np.stack([start, end], axis=1)
-        times = _julian_dates(known) if np.isfinite(known).all() and known.all() else None
+    times = None if start is None or end is None else np.stack([start, end], axis=1)
+    if times is not None:
+        times = Time(times, format="gps").utc.jd if np.isfinite(times).all() and times.all() else None
     return GainTable(
         _of_jones(values[..., ::2] + 1j * values[..., 1::2]),
         None if names is None else [str(name).strip() for name in names],
@@ -306,7 +293,7 @@ def read_h5parm(path: Path) -> GainTable:
         if len(sets) != 1:
             raise ValueError(f"it has the solution sets {', '.join(sets)}; one is needed")
         group = file[sets[0]]
-        names = [name for name in ("amplitude000", "phase000") if name in group]
+        names = [name for name in NEUTRAL if name in group]
         if not names:
             raise ValueError(f"it has {', '.join(group)}, and neither amplitude000 nor phase000")
         tables = {name: _soltab(group[name]) for name in names}
@@ -317,8 +304,8 @@ def read_h5parm(path: Path) -> GainTable:
                 axes[axis] = labels
             elif len(labels) > 1 and not np.array_equal(axes[axis], labels):
                 raise ValueError(f"amplitude000 and {name} have different axes {axis}")
-    amplitude, phase = (tables[name][0] if name in tables else None for name in ("amplitude000", "phase000"))
-    gains: Any = (1.0 if amplitude is None else amplitude) * (1.0 if phase is None else np.exp(-1j * phase))
+    amplitude, phase = (tables[name][0] if name in tables else fill for name, fill in NEUTRAL.items())
+    gains: Any = amplitude * np.exp(-1j * phase)
     feeds = None
     if "pol" in axes:
         kept = [place for place, name in enumerate(axes["pol"]) if name in FEEDS]
@@ -331,10 +318,7 @@ def read_h5parm(path: Path) -> GainTable:
 
 
 def _intervals(seconds: np.ndarray | None) -> np.ndarray | None:
-    """Return the start and end of solutions, Julian dates, (Ntimes, 2), for their centres, in s as modified dates.
-
-    The file does not say how long they are: they are taken to follow each other.
-    """
+    """Return start and end, Julian dates, (Ntimes, 2), of solutions, taken to follow each other, with centres in s."""
     if seconds is None or len(seconds) == 1:
         return None
     half = np.min(np.diff(seconds)) / 2
@@ -342,10 +326,7 @@ def _intervals(seconds: np.ndarray | None) -> np.ndarray | None:
 
 
 def _soltab(group: h5py.Group) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the values of a solution table, (ant, freq, time, pol), missing axes of length one, and its axes.
-
-    Values are NaN where their weight is zero.
-    """
+    """Return the values of a solution table, (ant, freq, time, pol), NaN where their weight is zero, and its axes."""
     names = _text(group["val"].attrs["AXES"]).split(",")
     values = group["val"][()]
     if "weight" in group:
@@ -374,13 +355,6 @@ def _solution_sets(file: h5py.File) -> list[str]:
     return [name for name in file if "h5parm_version" in file[name].attrs or name.startswith("sol")]
 
 
-def _has_solutions(path: Path) -> bool:
-    from astropy.io import fits
-
-    with fits.open(path) as hdus:
-        return "SOLUTIONS" in hdus
-
-
 def _column(hdus: Any, table: str, name: str, count: int) -> np.ndarray | None:
     """Return a column of a FITS table, or None if there is none; raises ValueError if it has another length."""
     if table not in hdus or name not in hdus[table].columns.names:
@@ -398,18 +372,10 @@ def _of_jones(jones: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.where(known, 1 / np.where(known, diagonal, 1).conj(), np.nan), 0, 2)
 
 
-def _julian_dates(gps: np.ndarray) -> np.ndarray:
-    """Return the Julian dates (UTC) of GPS seconds."""
-    from astropy.time import Time
-
-    return Time(gps, format="gps").utc.jd
-
-
 def write_gains(cal: UVCal, path: Path) -> None:
-    """Write gains by channel in the format of a suffix in `WRITERS`, for UVFITS files and measurement sets.
+    """Write gains by channel, of all antennas by number, in the format of a suffix in `WRITERS`.
 
-    All antennas of the telescope are written, by ascending number. Raises InputError for another suffix, and if a
-    format of Jones matrices lacks a feed.
+    Raises InputError for another suffix, and if a format of Jones matrices lacks a feed.
     """
     if path.suffix not in WRITERS:
         raise InputError(f"{path}: gains are not written as {path.suffix!r}; allowed are {', '.join(WRITERS)}")
@@ -450,15 +416,13 @@ def _write_hyperdrive(table: GainTable, path: Path) -> None:
 def _write_h5parm(table: GainTable, path: Path) -> None:
     import h5py
 
-    assert table.times is not None, "`of` knows them"
-    assert table.feeds is not None, "`of` knows them"
     hands = {number: name for name, number in PARALLEL_HANDS.items()}
     gains = table.gains.conj().transpose(2, 1, 0, 3)
     axes = {
-        "time": (table.times.mean(axis=1) - MJD_ZERO) * SECONDS_PER_DAY,
+        "time": (np.asarray(table.times).mean(axis=1) - MJD_ZERO) * SECONDS_PER_DAY,
         "freq": table.frequencies,
         "ant": _terminated(table.antennas or []),
-        "pol": _terminated([hands[int(feed)] for feed in table.feeds]),
+        "pol": _terminated([hands[feed] for feed in np.array(table.feeds).tolist()]),
     }
     with h5py.File(path, "w") as file:
         group = file.create_group("sol000")
@@ -483,11 +447,8 @@ WRITERS = {".h5": _write_h5parm, ".fits": _write_hyperdrive, ".bin": _write_mwao
 
 
 def _to_jones(table: GainTable, path: Path) -> np.ndarray:
-    """Return Jones matrices that calibrate, complex, (Ntimes, Nants, Nfreqs, 4).
-
-    Raises InputError if a feed is missing.
-    """
-    feeds = [] if table.feeds is None else table.feeds.tolist()
+    """Return Jones matrices that calibrate, complex, (Ntimes, Nants, Nfreqs, 4), or raise without both feeds."""
+    feeds = np.array(table.feeds).tolist()
     if sorted(feeds) != sorted(LINEAR):
         raise InputError(f"{path}: a Jones matrix has gains of xx and yy, and these are of {len(feeds)} feed(s)")
     gains = np.moveaxis(table.gains[..., [feeds.index(feed) for feed in LINEAR]], 2, 0)

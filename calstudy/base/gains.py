@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,43 +29,44 @@ def at_common_channels(first: UVCal, second: UVCal) -> tuple[UVCal, UVCal]:
     Raises InputError if there is no such channel, or one of them has no gains by channel.
     """
     for name, cal in (("first", first), ("second", second)):
-        if cal.cal_type != "gain" or cal.wide_band:
-            kind = f"solutions of type {cal.cal_type!r}" if cal.cal_type != "gain" else "gains of whole bands"
-            raise InputError(f"the {name} file holds {kind}; gains by channel are needed")
+        _require_channels(cal, f"the {name} file")
     width = min(np.min(cal.channel_width) for cal in (first, second))
     same = np.abs(first.freq_array[:, None] - second.freq_array) <= SAME_CHANNEL * width
     if not same.any():
         bands = [f"{cal.freq_array.min() / 1e6:.3f} to {cal.freq_array.max() / 1e6:.3f} MHz" for cal in (first, second)]
         raise InputError(f"the two files have no channel in common: {bands[0]}, and {bands[1]}")
-    chosen = [np.flatnonzero(same.any(axis=axis)) for axis in (1, 0)]
-    kept = [
-        cal if len(channels) == cal.Nfreqs else cal.select(freq_chans=channels, inplace=False)
-        for cal, channels in zip((first, second), chosen, strict=True)
-    ]
-    return kept[0], kept[1]
+    one, other = (
+        cal if chosen.all() else cal.select(freq_chans=np.flatnonzero(chosen), inplace=False)
+        for cal, chosen in ((first, same.any(axis=1)), (second, same.any(axis=0)))
+    )
+    return one, other
+
+
+def _require_channels(cal: UVCal, what: str) -> None:
+    if cal.cal_type != "gain" or cal.wide_band:
+        kind = f"{cal.cal_type} solutions" if cal.cal_type != "gain" else "gains of whole bands"
+        raise InputError(f"{what} holds {kind}; gains by channel are needed")
 
 
 def make_uvcal(template: UVData, gains: np.ndarray, flags: np.ndarray | None = None) -> UVCal:
     """Return gains as UVCal, for all antennas of the template's telescope and the feeds of its polarizations.
 
     `gains` are complex, (Nants_telescope, Nfreqs, Ntimes, Npols) in the order of `telescope.antenna_numbers`. Ntimes is
-    the template's, or 1 for gains that are constant during the run. `flags` have the same shape; by default none is
-    set.
+    the template's, or 1 for gains that are constant during the run. `flags` have the same shape; none by default.
     """
     from pyuvdata import UVCal
 
-    constant = gains.shape[2] == 1 and template.Ntimes > 1
-    times = np.unique(template.time_array)
-    time = {"time_range": np.array([[times[0], times[-1]]])} if constant else {"time_array": times}
+    times, integration = np.unique(template.time_array), float(template.integration_time[0])
+    time: dict[str, Any] = {"time_array": times, "integration_time": integration}
+    if gains.shape[2] == 1 and template.Ntimes > 1:
+        whole = float(np.ptp(times) * SECONDS_PER_DAY + integration)
+        time = {"time_range": times[None, [0, -1]], "integration_time": whole}
     cal = UVCal.new(
         telescope=template.telescope,
         freq_array=template.freq_array,
         channel_width=template.channel_width,
         flex_spw_id_array=template.flex_spw_id_array,
         spw_array=template.spw_array,
-        integration_time=float(np.ptp(times) * SECONDS_PER_DAY + template.integration_time[0])
-        if constant
-        else float(template.integration_time[0]),
         # pyuvdata numbers the Jones element Jxx of a feed like the polarization xx, and Jyy like yy.
         jones_array=template.polarization_array,
         ant_array=template.telescope.antenna_numbers,
@@ -92,13 +93,9 @@ ERRORS_GROUP = "GainErrors"
 class ErrorsOfFile(NamedTuple):
     """Standard deviations of the gains of a file, with their axes; NaN is none.
 
-    Attributes
-    ----------
-    amplitude, phase : of |g| and of the phase of g in rad, (Nants, Nfreqs, Ntimes, Npols)
-    smooth_delay
-        Largest delay, s, of sequences in frequency that are no part of the errors; zero if there are none, NaN if the
-        file does not say it.
-    realizations : of the noise, from which the errors are; zero if they are of the fit's own matrix
+    Those of |g| and of the phase of g, rad, are (Nants, Nfreqs, Ntimes, Npols). Sequences in frequency up to the
+    `smooth_delay`, s, are no part of them; it is zero if there are none, NaN if the file does not say it. They are from
+    a number of realizations of the noise, or zero if they are of the fit's own matrix.
     """
 
     amplitude: np.ndarray
@@ -128,9 +125,8 @@ def find_gain_errors(path: Path) -> ErrorsOfFile | None:
         if ERRORS_GROUP not in file:
             return None
         group = file[ERRORS_GROUP]
-        smooth_delay = float(group.attrs.get("smooth_delay", np.nan))
-        count = int(group.attrs.get("realizations", 0))
-        return ErrorsOfFile(group["amplitude"][()], group["phase"][()], smooth_delay, count)
+        delay, count = float(group.attrs.get("smooth_delay", np.nan)), int(group.attrs.get("realizations", 0))
+        return ErrorsOfFile(group["amplitude"][()], group["phase"][()], delay, count)
 
 
 def read_gain_errors(path: Path) -> ErrorsOfFile:
@@ -145,10 +141,9 @@ def read_gain_errors(path: Path) -> ErrorsOfFile:
 
 
 def draw_gains(cal: UVCal, errors: ErrorsOfFile, solves: Sequence[slice], seed: int) -> UVCal:
-    """Return gains that deviate from given ones by a draw of their errors, independent by antenna and channel.
+    """Return gains that deviate by a draw of their errors, if any, independent by antenna and channel.
 
-    Errors are those of `read_gain_errors`; gains without an error stay as they are. Integrations that were solved
-    together, `solves`, have one deviation.
+    Integrations that were solved together, `solves`, have one deviation.
     """
     deviation = np.random.default_rng(seed).standard_normal((2, *cal.gain_array.shape))
     for times in solves:
@@ -170,11 +165,9 @@ def gain_products(cal: UVCal, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def gains_for(cal: UVCal, template: UVData) -> np.ndarray:
-    """Return the gains of the antennas of the template's baselines, at its channels and polarizations.
+    """Return the gains of the antennas of the template's baselines, by ascending number; NaN where they are flagged.
 
-    They are complex128, (Nants, Nfreqs, Ntimes of `cal`, Npols), by ascending number of the antennas and in the
-    convention "divide"; NaN where they are flagged. Raises InputError if `cal` has delays, or lacks an antenna, a
-    channel or a polarization of the template.
+    As `solutions`, at the channels and polarizations of the template. Raises InputError as `require_solutions` too.
     """
     numbers = np.unique(antenna_pairs(template))
     require_solutions(cal, numbers, template.freq_array, np.min(template.channel_width))
@@ -201,9 +194,7 @@ def closest_solutions(cal: UVCal, times: np.ndarray) -> np.ndarray:
 
 def require_solutions(cal: UVCal, numbers: np.ndarray, frequencies: np.ndarray, width: float) -> None:
     """Raise InputError if gains are delays, or lack antennas (numbers) or channels (Hz, to a tenth of `width`)."""
-    if cal.cal_type != "gain" or cal.wide_band:
-        kind = f"{cal.cal_type} solutions" if cal.cal_type != "gain" else "gains of whole bands"
-        raise InputError(f"gains: holds {kind}; gains by channel are needed")
+    _require_channels(cal, "gains:")
     missing = np.setdiff1d(numbers, cal.ant_array)
     if missing.size:
         raise InputError(f"gains: no solution for antenna(s) {', '.join(map(str, missing))} of the data")
@@ -222,9 +213,8 @@ def solutions(
     (len(numbers), len(frequencies), Ntimes of `cal`, len(polarizations)). `polarizations` are AIPS numbers; raises
     InputError if `cal` lacks one, or if all gains are zero or not finite.
     """
-    for pol in polarizations:
-        if pol not in cal.jones_array:
-            raise InputError(f"gains: no solution for polarization {polarization_names([pol])} of the data")
+    if missing := [pol for pol in polarizations if pol not in cal.jones_array]:
+        raise InputError(f"gains: no solution for polarization {polarization_names(missing[:1])} of the data")
     rows, feeds = positions(cal.ant_array, numbers), positions(cal.jones_array, polarizations)
     channels = np.abs(cal.freq_array[None] - frequencies[:, None]).argmin(axis=1)
     gains, flags = (array[rows][:, channels][..., feeds] for array in (cal.gain_array, cal.flag_array))

@@ -16,12 +16,10 @@ from calstudy.base.user_code import digest_file, identity_of_file
 def identity(value: Any) -> Any:
     """Return settings as JSON that is the same for settings that give the same result.
 
-    Fields of sections are omitted if they have their default, so that a new field does not change the keys of
-    earlier products; a change of a default requires a new version of the stages that read it. A field may have a
-    version of its own (`calstudy.base.schema.REVISED`), where only its other values give new results. The tag of a
-    choice between blocks is always present unless it is the default choice. An input file is identified by its
-    content, a Python file also by that of the modules that it imports from its folder, a folder by the names and
-    contents of its files, and a plug-in by its file or the version of its package.
+    Fields of sections are omitted if they have their default, so that a new field does not change the keys of earlier
+    products; a change of a default requires a new version of the stages that read it, or of the field
+    (`calstudy.base.schema.REVISED`). Files, and folders of them, are identified by their content (`identity_of_file`),
+    and a plug-in by its file or the version of its package.
     """
     if isinstance(value, BaseModel):
         return _identity_of_section(value)

@@ -24,6 +24,13 @@ DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZ
 """Errors that numpy raises for an .npz file that was changed or truncated."""
 
 
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an npz file; raises one of `DAMAGE` if it cannot be read."""
+    # numpy does not close a damaged file that it opens itself.
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+        return dict(file)
+
+
 def kept_arrays(
     name: str, identity: Mapping[str, Any], compute: Callable[[], Mapping[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
@@ -34,16 +41,14 @@ def kept_arrays(
     """
     path = default_directory() / f"{name}-{digest_json(identity)}.npz"
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays = read_arrays(path)
+        with suppress(OSError):
+            os.utime(path)
+        return arrays
     except FileNotFoundError:
         logger.info("%s: computed, for %s is not there", name, path)
     except DAMAGE as error:
         logger.warning("%s: computed, for %s cannot be read (%s)", name, path, error)
-    else:
-        with suppress(OSError):
-            os.utime(path)
-        return arrays
     arrays = {key: np.asarray(value) for key, value in compute().items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

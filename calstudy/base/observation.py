@@ -1,8 +1,4 @@
-"""Visibilities and the metadata of their array as plain arrays, extracted once from a UVData.
-
-`Frame` has the metadata that are known before there are data: antennas, baselines, channels. `Observation` adds the
-visibilities.
-"""
+"""Visibilities and the metadata of their array, which are known before there are data, as arrays from a UVData."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, flag_cube, positions, require_rectangular, to_cube
 
 if TYPE_CHECKING:
@@ -21,13 +16,9 @@ if TYPE_CHECKING:
 class Frame:
     """Antennas, baselines and channels. All arrays are read-only.
 
-    Parameters
-    ----------
-    numbers : number of each antenna that is in a baseline, ascending, (Nants,) int
-    positions : antenna positions, east, north, up, m, (Nants, 3)
-    antennas : the two antennas (a, b) of each baseline as indices into `numbers`, (Nbls, 2) int
-    frequencies : channel centres, Hz, (Nfreqs,)
-    n_times, n_polarizations : numbers of integrations and polarizations
+    `numbers` are those of the antennas that are in a baseline, ascending, and `positions` theirs, east, north, up, m,
+    (Nants, 3). `antennas` are the two of each baseline as indices into `numbers`, (Nbls, 2), and `frequencies` the
+    channel centres, Hz.
     """
 
     def __init__(
@@ -90,34 +81,19 @@ class Frame:
     def baselines(self, chosen: np.ndarray) -> Frame:
         """Return the same with some of the baselines, selected by a bool array (Nbls,)."""
         kept, antennas = np.unique(self.antennas[chosen], return_inverse=True)
-        return Frame(
-            self.numbers[kept],
-            self.positions[kept],
-            antennas.reshape(-1, 2),
-            self.frequencies,
-            self.n_times,
-            self.n_polarizations,
-        )
+        numbers, places, sizes = self.numbers[kept], self.positions[kept], (self.n_times, self.n_polarizations)
+        return Frame(numbers, places, antennas.reshape(-1, 2), self.frequencies, *sizes)
 
 
 class Observation(Frame):
     """Visibilities of every baseline at every time, with their antennas, baselines and channels.
 
-    They are of a UVData, rectangular and time-major: all baselines of the first integration, then of the second, and so
-    on. It is not copied, and must not be changed afterwards. It may be without data; then there are no visibilities.
-    Raises InputError if it is not rectangular.
-
-    Attributes
-    ----------
-    times : Julian date of each integration, (Ntimes,)
-    polarizations : AIPS numbers, such as -5 for XX, (Npols,)
+    They are of a UVData, which is not copied, must not be changed afterwards, and may be without data. Raises
+    InputError unless it is rectangular and time-major. `times` are Julian dates, and `polarizations` AIPS numbers.
     """
 
     def __init__(self, uvd: UVData) -> None:
-        try:
-            require_rectangular(uvd)
-        except ValueError as error:
-            raise InputError(str(error)) from None
+        require_rectangular(uvd)
         numbers, antennas = np.unique(antenna_pairs(uvd), return_inverse=True)
         rows = positions(uvd.telescope.antenna_numbers, numbers)
         super().__init__(
@@ -152,8 +128,8 @@ class Observation(Frame):
         """The same as a UVData with read-only arrays of samples; ``uvd.copy()`` can be changed."""
         shell = self._uvd.copy(metadata_only=True)
         for name in ("data_array", "flag_array", "nsample_array"):
-            if getattr(self._uvd, name) is not None:
-                setattr(shell, name, read_only(getattr(self._uvd, name)))
+            if (samples := getattr(self._uvd, name)) is not None:
+                setattr(shell, name, read_only(samples))
         return shell
 
     def baselines(self, chosen: np.ndarray) -> Observation:

@@ -46,7 +46,7 @@ def experiment_names() -> list[str]:
 def find_experiment(path: Path) -> Path:
     """Return the path of an experiment file, given its path or the name of a published one, such as ``quickstart``.
 
-    Raises InputError if it is a name without suffix or folder, and neither a file nor a published experiment.
+    Raises InputError if it is a bare name of neither.
     """
     is_there = path.exists()
     if (is_there and not path.is_dir()) or path.name != str(path) or path.suffix:
@@ -78,11 +78,9 @@ def default_directory() -> Path:
 
 
 def download(url: str, path: Path, instead: str, known_hash: str | None = None, progress: bool = True) -> None:
-    """Download a file, completely or not at all, and create its folder.
+    """Download a file, completely or not at all; an existing one is kept if its SHA-256 is `known_hash`.
 
-    An existing file is kept if its SHA-256 is `known_hash`, otherwise it is replaced. `instead` is the alternative for
-    the user in the error message. Raises InputError if the server cannot be reached or has no such file, the folder
-    cannot be written, or the hash differs.
+    Raises InputError, with the alternative `instead`, if it cannot be had or written, or the hash differs.
     """
     import pooch
     import requests
@@ -111,10 +109,9 @@ REPOSITORY = (
 
 @dataclass(frozen=True)
 class MwaFile:
-    """A data file of mwa_pb 1.1, `packaged` or from `url`, where it must have the same SHA-256.
+    """A data file of mwa_pb 1.1, `packaged` or from `url`; messages say its `content`, and what to do `instead`.
 
-    `content` and `instead` are for messages: what it is, and what can be done without it. `fetched_as` is its name for
-    ``calstudy data fetch``.
+    `fetched_as` is its name for ``calstudy data fetch``.
     """
 
     packaged: PackageFile
@@ -130,19 +127,13 @@ class MwaFile:
         return Path(self.packaged.name).name
 
     def fetch(self, directory: Path | None = None, progress: bool = True) -> Path:
-        """Download the file, or verify an existing copy; the directory is by default `default_directory`.
-
-        Raises InputError if the download fails or is not the file.
-        """
+        """Download the file, by default to `default_directory`, or verify an existing copy; errors of `download`."""
         path = (default_directory() if directory is None else directory) / self.name
         download(self.url, path, f"install mwa_pb 1.1, or {self.instead}", known_hash=self.sha256, progress=progress)
         return path
 
     def find(self) -> Path:
-        """Return the path of the file in the mwa_pb package or, if that is not there, of the downloaded file.
-
-        Raises InputError if there is neither.
-        """
+        """Return the path of the file in mwa_pb, or else of the downloaded one; raises InputError without either."""
         with suppress(InputError):
             if (packaged := self.packaged.path).is_file():
                 return packaged

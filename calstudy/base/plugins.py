@@ -16,6 +16,7 @@ from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from pkgutil import resolve_name
 from types import ModuleType
 from typing import Any, ClassVar, TypeVar
 
@@ -32,8 +33,7 @@ FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]
 class Plugin(Section):
     """The base class of all plug-ins. Subclasses declare settings as fields, and behaviour as methods.
 
-    The base class of each kind sets the `registry`. The version of a built-in plug-in is increased whenever its results
-    change, so that the products that depend on it are made again.
+    The base class of each kind sets the `registry`. The version of a built-in one is raised when its results change.
     """
 
     registry: ClassVar[Registry]
@@ -80,8 +80,7 @@ class Plugin(Section):
 
 
 def _revive(base_path: str, block: Mapping[str, Any]) -> Plugin:
-    module, _, name = base_path.partition(":")
-    return getattr(import_module(module), name).registry.make(block)
+    return resolve_name(base_path).registry.make(block)
 
 
 P = TypeVar("P", bound=Plugin)
@@ -91,15 +90,13 @@ class Registry(Kinds[P]):
     """All plug-ins of one kind: the built-in ones, those of installed packages, and those in files.
 
     The `noun` names the kind, such as "calibrator", and `base_path` is ``module:class`` of its base class. The built-in
-    ones are in the modules of `package`; module `sky_based` contains ``sky-based``, and modules whose name starts with
-    an underscore contain none. With `families`, a module may have several classes or none, and a class several names
-    (`Plugin.names`); names that are defaults of the tag are read from the text of the modules, without importing them.
+    ones are in the modules of `package`; module `sky_based` contains ``sky-based``. With `families`, a module may have
+    several classes or none; names that are defaults of the tag are read from its text, without importing it.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
         super().__init__(tag)
         self.noun, self.package, self.base_path, self.families = noun, package, base_path, families
-        self.group = f"calstudy.{noun}s"
         self.a_noun = f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"
 
     def read(self, annotation: Any) -> None:
@@ -113,8 +110,7 @@ class Registry(Kinds[P]):
     @property
     def base(self) -> type[P]:
         """The base class."""
-        module, _, name = self.base_path.partition(":")
-        return getattr(import_module(module), name)
+        return resolve_name(self.base_path)
 
     def built_in(self) -> list[str]:
         """Return the names of the built-in plug-ins."""
@@ -155,17 +151,14 @@ class Registry(Kinds[P]):
 
     def installed(self) -> dict[str, EntryPoint]:
         """Return the entry points of installed packages, by name."""
-        return {point.name: point for point in entry_points(group=self.group)}
+        return {point.name: point for point in entry_points(group=f"calstudy.{self.noun}s")}
 
     def names(self) -> list[str]:
         """Return all names: built in, and of installed packages."""
         return [*self.built_in(), *sorted(set(self.installed()) - set(self.built_in()))]
 
     def find(self, reference: str) -> type[P]:
-        """Return the class of a plug-in, given a name or the path of a Python file, with ``:Class`` if it has several.
-
-        Raises InputError if there is none; the message does not name the field.
-        """
+        """Return the class of a plug-in, given a name or a Python file, with ``:Class`` if it has several, or raise."""
         if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
             return self._in(load_file(Path(file["path"])), reference, file["name"])
         if reference in self._modules:
@@ -202,35 +195,27 @@ class Registry(Kinds[P]):
     def _in(self, module: ModuleType, reference: str, name: str | None = None) -> type[P]:
         """Return the only class that a module defines, or the one of this name."""
         found = self._things(module)
-        if name is not None and name not in found:
-            raise InputError(f"{reference!r} holds no {self.noun} of this name (it has: {self._listed(module)})")
-        if name is None and len(found) != 1:
-            raise InputError(
-                f"{reference!r} must hold one {self.noun}, or be followed by ':Class' (it has: {self._listed(module)})"
-            )
-        return found[name or next(iter(found))]
-
-    def _listed(self, module: ModuleType) -> str:
-        """Return the names of a module's classes, and what those that cannot be used lack."""
+        if name in found or (name is None and len(found) == 1):
+            return found[name or next(iter(found))]
         lacking = [
-            f"{name} without {', '.join(sorted(value.__abstractmethods__))}"
-            for name, value in self._things(module, abstract=True).items()
+            f"{other} without {', '.join(sorted(value.__abstractmethods__))}"
+            for other, value in self._things(module, abstract=True).items()
         ]
-        base = f"no subclass of {self.base.__module__}.{self.base.__name__}"
-        return "; ".join([*self._things(module), *lacking]) or base
+        listed = "; ".join([*found, *lacking]) or f"no subclass of {self.base.__module__}.{self.base.__name__}"
+        several = f"must hold one {self.noun}, or be followed by ':Class'"
+        what = several if name is None else f"holds no {self.noun} of this name"
+        raise InputError(f"{reference!r} {what} (it has: {listed})")
 
     def _things(self, module: ModuleType, abstract: bool = False) -> dict[str, type[P]]:
         """Return the classes that a module defines, by name; or those `abstract`, which lack methods."""
+        own = {name: value for name, value in vars(module).items() if inspect.isclass(value) and value is not self.base}
         return {
             name: value
-            for name, value in vars(module).items()
-            if self._is_thing(value, module) and inspect.isabstract(value) == abstract
+            for name, value in own.items()
+            if issubclass(value, self.base)
+            and (value.__module__, inspect.isabstract(value)) == (module.__name__, abstract)
+            and not value.__name__.startswith("_")
         }
-
-    def _is_thing(self, value: Any, module: ModuleType) -> bool:
-        if not (inspect.isclass(value) and issubclass(value, self.base)):
-            return False
-        return value is not self.base and value.__module__ == module.__name__ and not value.__name__.startswith("_")
 
     def _checked(self, found: type, reference: str) -> type[P]:
         if not issubclass(found, self.base):
@@ -259,8 +244,7 @@ class Registry(Kinds[P]):
 
     def identity(self, reference: str) -> str:
         """Return the identity of a plug-in's code: its name or package with a version, or the digest of its file."""
-        file = FILE_REFERENCE.fullmatch(reference)
-        if file is not None:
+        if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
             return identity_of_file(Path(file["path"]), f":{file['name'] or ''}")
         if reference in self._modules:
             version = self.find(reference).version
@@ -276,8 +260,5 @@ def _named_after(module: str) -> str:
 
 
 def guarded(thing: Plugin) -> AbstractContextManager[None]:
-    """Return a context for calls of a plug-in's methods, in which errors of a user's code become `UserCodeError`.
-
-    Errors of built-in plug-ins pass unchanged.
-    """
+    """Return a context for calls of a plug-in, in which errors of a user's code become `UserCodeError`; ours pass."""
     return nullcontext() if thing.is_built_in else user_code(thing.label)

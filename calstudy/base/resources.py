@@ -35,11 +35,8 @@ def parse_memory(text: str) -> float:
 
     Raises InputError if it is not a positive number with one of the units MB, GB, TB.
     """
-    found = re.fullmatch(r"\s*([0-9.]+)\s*([MGT]B)\s*", text)
-    try:
-        number = float(found[1]) * BYTES[found[2]] if found else 0.0
-    except ValueError:
-        number = 0.0
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*([MGT]B)\s*", text, flags=re.ASCII)
+    number = float(found[1]) * BYTES[found[2]] if found else 0.0
     if number <= 0:
         raise InputError(f"--max-memory {text!r}: write a positive number and a unit (MB, GB or TB), such as '6 GB'")
     return number
@@ -59,11 +56,9 @@ def cpu_time() -> float:
 
 @dataclass
 class Usage:
-    """Elapsed seconds, CPU seconds and peak resident memory (bytes) of a block of code.
+    """Elapsed seconds, CPU seconds (see `cpu_time`) and peak resident memory (bytes) of a block of code, after it.
 
-    Use it as a context manager; the values are available after the block. CPU seconds are those of all threads of this
-    process, and of programs that it started, once it has waited for their end; these are counted in steps of 10 ms on
-    Linux, and not at all on Windows. The memory is that of this process alone, sampled every 50 ms.
+    The memory is that of this process alone, sampled every 50 ms.
     """
 
     seconds: float = 0.0

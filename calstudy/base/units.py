@@ -42,6 +42,12 @@ def _fail(value: Any, reason: str) -> PydanticCustomError:
     return PydanticCustomError("quantity", "{value} {reason}", {"value": repr(value), "reason": reason})
 
 
+def _split(value: Any) -> tuple[float, str | None]:
+    """Return the number and the unit of a text; the unit is None for anything else."""
+    match = NUMBER.match(value) if isinstance(value, str) else None
+    return (math.nan, None) if match is None else (float(match[1]), match[2])
+
+
 def parse_quantity(value: Any, target: str, example: str) -> float:
     """Convert ``"80 kHz"`` or an astropy quantity to a float in the unit `target`.
 
@@ -51,13 +57,10 @@ def parse_quantity(value: Any, target: str, example: str) -> float:
     hint = f'write a number with a unit, such as "{example}"'
     if hasattr(value, "unit"):
         number, unit = float(value.value), value.unit.to_string()
-    elif isinstance(value, str):
-        match = NUMBER.match(value)
-        if match is None:
-            raise _fail(value, f"is not a quantity: {hint}")
-        number, unit = float(match[1]), match[2]
     else:
-        raise _fail(value, f"has no unit: {hint}")
+        number, unit = _split(value)
+    if unit is None and isinstance(value, str):
+        raise _fail(value, f"is not a quantity: {hint}")
     if not unit:
         raise _fail(value, f"has no unit: {hint}")
     if not math.isfinite(number):
@@ -72,40 +75,37 @@ def parse_quantity(value: Any, target: str, example: str) -> float:
 
 def parse_decibel(value: Any) -> float:
     """Convert ``"-40 dB"`` to the float -40.0; raises PydanticCustomError for anything else."""
-    match = NUMBER.match(value) if isinstance(value, str) else None
-    if match is None or match[2] != "dB":
+    number, unit = _split(value)
+    if unit != "dB":
         raise _fail(value, 'is not a level in decibel: write for example "-40 dB"')
-    if not abs(float(match[1])) <= LARGEST_DECIBEL:
+    if abs(number) > LARGEST_DECIBEL:
         raise _fail(value, f"is beyond {LARGEST_DECIBEL} dB either way")
-    return float(match[1])
+    return number
 
 
 def parse_hour_angle(value: Any) -> float:
     """Convert ``"1.8 h"`` or an angle (``"27 deg"``) to a float in hours of right ascension."""
-    match = NUMBER.match(value) if isinstance(value, str) else None
-    if match is not None and match[2] in ("h", "hr", "hour"):
-        return float(match[1])
-    return parse_quantity(value, "hourangle", "1.8 h")
+    number, unit = _split(value)
+    return number if unit in ("h", "hr", "hour") else parse_quantity(value, "hourangle", "1.8 h")
 
 
 def parse_wavenumber(value: Any) -> float:
     """Convert ``"0.2 h/Mpc"`` to a float in h/Mpc; other units are refused, because h depends on the cosmology."""
-    match = NUMBER.match(value) if isinstance(value, str) else None
-    if match is None or match[2].replace(" ", "") not in ("h/Mpc", "hMpc-1", "hMpc^-1"):
+    number, unit = _split(value)
+    if (unit or "").replace(" ", "") not in ("h/Mpc", "hMpc-1", "hMpc^-1"):
         raise _fail(value, 'is not a wavenumber: write for example "0.2 h/Mpc"')
-    return float(match[1])
+    return number
 
 
 def parse_fraction(value: Any) -> float:
     """Convert ``"15 %"`` or the number 0.15 to the float 0.15; raises PydanticCustomError for anything else."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if not math.isfinite(value):
-            raise _fail(value, "is not finite")
-        return float(f"{value:.15g}")
-    match = NUMBER.match(value) if isinstance(value, str) else None
-    if match is None or match[2] not in ("", "%"):
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    number, unit = (value, "") if plain else _split(value)
+    if unit not in ("", "%"):
         raise _fail(value, 'is not a fraction: write for example "15 %" or 0.15')
-    return float(f"{float(match[1]) / (100 if match[2] else 1):.15g}")
+    if plain and not math.isfinite(number):
+        raise _fail(value, "is not finite")
+    return float(f"{number / (100 if unit else 1):.15g}")
 
 
 def _field(validate: Callable[[Any], float], unit: str, example: str) -> Any:

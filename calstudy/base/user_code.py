@@ -10,13 +10,13 @@ import inspect
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from threading import Lock, current_thread, main_thread
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 from calstudy.base.errors import InputError
@@ -32,9 +32,8 @@ _PARSING = Lock()
 def parse(code: str) -> ast.Module:
     """Parse Python code while no other thread can run.
 
-    Python 3.11 has one counter of the depth of a tree for all threads, and fails with SystemError where another thread
-    parses in the meantime. A thread is left while it parses only by the garbage collector, where it runs code of
-    objects that it deletes.
+    Python 3.11 counts the depth of trees of all threads together, and fails with SystemError where another one parses
+    in the meantime; only the garbage collector leaves a thread that parses.
     """
     with _PARSING:
         collects = gc.isenabled()
@@ -114,22 +113,21 @@ def _imported(path: Path, in_functions: bool = False) -> Iterator[str]:
 def load_file(path: Path) -> ModuleType:
     """Run a Python file as a module, once for each version of its content, and return the module.
 
-    It can import modules of its folder, which are then run again; those of other folders have no influence, whatever
-    their names are. Raises InputError if the file cannot be read or is not valid Python, if running it raises an error
-    (the message names the line), or if code of files is refused.
+    It can import modules of its folder, which are then run again. Raises InputError if the file cannot be read or is
+    not valid Python, if running it raises an error (the message names the line), or if code of files is refused.
     """
     content, beside = _read_code(path)
     name = f"{FILE_MODULE}{path.stem}_{hashlib.sha256(f'{path}{content}'.encode()).hexdigest()[:12]}"
     if name in sys.modules:
         return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise InputError(f"{str(path)!r} is not a Python file")
+    loader = _Uncompiled(name, str(path))
+    spec = importlib.util.spec_from_file_location(name, path, loader=loader)
+    assert spec is not None, "there is a loader"
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        with _modules_beside(path, beside), _without_compiled_files(path, *beside.values()), user_code(path.name):
-            spec.loader.exec_module(module)
+        with _modules_beside(path, beside), user_code(path.name):
+            loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
@@ -143,13 +141,13 @@ def _modules_beside(path: Path, beside: dict[str, Path]) -> Iterator[None]:
     Raises InputError if a function imports such a module, since a call would import that of the other file.
     """
     own = {name: found for name, found in beside.items() if not _is_installed(name.partition(".")[0])}
-    later = {name for file in (path, *own.values()) for name in _imported(file, in_functions=True)} & own.keys()
-    if later:
-        # They may import any of the others, and as late.
-        later = set(own)
+    late = {name for file in (path, *own.values()) for name in _imported(file, in_functions=True)}
+    # They may import any of the others, and as late.
+    later = set() if late.isdisjoint(own) else set(own)
     for name in own:
-        other = _LATER.get(name) or (_file_of(name) if name in later else None)
-        if other is not None and other.is_file() and digest_file(other) != digest_file(own[name]):
+        loaded = getattr(sys.modules.get(name), "__file__", None) if name in later else None
+        other = Path(_LATER.get(name) or loaded or own[name])
+        if other.is_file() and digest_file(other) != digest_file(own[name]):
             raise InputError(
                 f"{path.name} imports {own[name]}, another file imports {other} by the same name, and a function may "
                 f"import either when it is called; import {name} at the top of both files, or rename it"
@@ -168,6 +166,13 @@ def _modules_beside(path: Path, beside: dict[str, Path]) -> Iterator[None]:
             sys.meta_path.insert(0, _CALLED)
 
 
+class _Uncompiled(SourceFileLoader):
+    """Neither reads nor writes compiled code, which Python takes for current if second and size are the same."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 class _Beside(MetaPathFinder):
     """Finds modules by name in a given table."""
 
@@ -176,7 +181,9 @@ class _Beside(MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         del path, target
-        return importlib.util.spec_from_file_location(fullname, file) if (file := self.files.get(fullname)) else None
+        if (file := self.files.get(fullname)) is None:
+            return None
+        return importlib.util.spec_from_file_location(fullname, file, loader=_Uncompiled(fullname, str(file)))
 
 
 _LATER: dict[str, Path] = {}
@@ -184,32 +191,12 @@ _LATER: dict[str, Path] = {}
 _CALLED = _Beside(_LATER)
 
 
-def _file_of(module: str) -> Path | None:
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return None if file is None else Path(file)
-
-
 def _is_installed(name: str) -> bool:
     """Return whether a module belongs to Python or to an installed package."""
     if name in sys.stdlib_module_names:
         return True
-    spec = PathFinder.find_spec(
-        name, [place for place in sys.path if "site-packages" in place or "dist-packages" in place]
-    )
-    return spec is not None
-
-
-@contextmanager
-def _without_compiled_files(*paths: Path) -> Iterator[None]:
-    """Neither read nor write compiled code of files, which Python takes for current if second and size are the same."""
-    for path in paths:
-        with suppress(OSError):
-            Path(importlib.util.cache_from_source(str(path))).unlink(missing_ok=True)
-    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-    try:
-        yield
-    finally:
-        sys.dont_write_bytecode = before
+    places = [place for place in sys.path if "site-packages" in place or "dist-packages" in place]
+    return PathFinder.find_spec(name, places) is not None
 
 
 def _read_code(path: Path) -> tuple[str, dict[str, Path]]:
@@ -220,22 +207,20 @@ def _read_code(path: Path) -> tuple[str, dict[str, Path]]:
         text = path.read_text(encoding="utf-8")
         parse(text)
         beside = beside_of(path)
-        content = "".join([text, *(f"{name} {digest_file(found)}" for name, found in sorted(beside.items()))])
+        return "".join([text, *(f"{name} {digest_file(found)}" for name, found in sorted(beside.items()))]), beside
     except OSError as error:
-        raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
+        fault = f"cannot be read ({error.strerror})"
     except UnicodeDecodeError:
-        raise InputError(f"{str(path)!r} is not a text file in UTF-8") from None
-    except (SyntaxError, ValueError) as error:
-        line = f"line {error.lineno}: {error.msg}" if isinstance(error, SyntaxError) else str(error)
-        raise InputError(f"{str(path)!r} is not valid Python ({line})") from None
-    return content, beside
+        fault = "is not a text file in UTF-8"
+    except SyntaxError as error:
+        fault = f"is not valid Python (line {error.lineno}: {error.msg})"
+    except ValueError as error:
+        fault = f"is not valid Python ({error})"
+    raise InputError(f"{str(path)!r} {fault}")
 
 
 def load_function(path: Path, name: str) -> Callable[..., Any]:
-    """Return a function that a Python file defines.
-
-    Raises InputError if the file cannot be run, or defines no such function.
-    """
+    """Return a function that a Python file defines; raises InputError if it does not, or cannot be run."""
     module = load_file(path)
     functions = {
         key: value
@@ -270,8 +255,8 @@ def user_code(name: str) -> Iterator[None]:
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
         if not frames and not isinstance(error, TypeError | SystemExit | ImportError):
             raise
-        lines = [f"{Path(frame.filename).name} line {frame.lineno}, in {frame.name}" for frame in frames[-1:]]
-        place = lines[0] if lines else name
+        for frame in frames[-1:]:
+            name = f"{Path(frame.filename).name} line {frame.lineno}, in {frame.name}"
         if isinstance(error, SystemExit | KeyboardInterrupt):
             how = f"sys.exit, status {error.code}" if isinstance(error, SystemExit) else "KeyboardInterrupt"
             text = f"it ended the process ({how}); raise an error instead"
@@ -280,7 +265,7 @@ def user_code(name: str) -> Iterator[None]:
             text = f"`{given}` has no type: write one, as in `size: float = 1.0`, or ClassVar where it is no setting"
         else:
             text = f"{type(error).__name__}: {error}"
-        raise UserCodeError(f"{place}: {text}") from error
+        raise UserCodeError(f"{name}: {text}") from error
 
 
 def _is_users(filename: str) -> bool:

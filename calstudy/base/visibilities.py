@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 
 @cache
 def keep_compiled_pyuvdata() -> None:
-    """Cache pyuvdata's compiled conversions of baseline numbers on disk, because each process would compile them again.
-
-    Numba stores them beside the package, or in the user's cache folder if that cannot be written.
-    """
+    """Cache pyuvdata's compiled conversions of baseline numbers on disk: each process would compile them again."""
     from pyuvdata.utils import antnums_to_baseline, baseline_to_antnums, bls
 
     names = ("_max_ant", "_min_ant", "_antnums_to_baseline", "_baseline_to_antnums")
@@ -43,11 +40,11 @@ def keep_compiled_pyuvdata() -> None:
 
 
 def require_rectangular(uvd: UVData) -> None:
-    """Raise ValueError unless all baselines are present at all times in time-major order."""
+    """Raise InputError unless all baselines are present at all times in time-major order."""
     n_bls, n_times = uvd.Nbls, uvd.Ntimes
     baselines = uvd.baseline_array.reshape(n_times, n_bls) if uvd.Nblts == n_bls * n_times else None
     if baselines is None or (baselines != baselines[0]).any():
-        raise ValueError(
+        raise InputError(
             f"the visibilities are not rectangular: {uvd.Nblts} samples of {n_bls} baselines at {n_times} times, "
             "expected every baseline once at every time, ordered by time"
         )
@@ -76,12 +73,9 @@ def from_cube(template: UVData, cube: np.ndarray) -> UVData:
         raise ValueError(f"visibilities have shape {cube.shape}, the template needs {shape}")
     uvd = template.copy(metadata_only=True)
     uvd.data_array = np.ascontiguousarray(cube).reshape(template.Nblts, template.Nfreqs, template.Npols)
-    if template.flag_array is not None:
-        uvd.flag_array = template.flag_array.copy()
-        uvd.nsample_array = template.nsample_array.copy()
-    else:
-        uvd.flag_array = np.zeros(uvd.data_array.shape, dtype=bool)
-        uvd.nsample_array = np.ones(uvd.data_array.shape, dtype=np.float32)
+    empty = template.flag_array is None
+    uvd.flag_array = np.zeros(uvd.data_array.shape, bool) if empty else template.flag_array.copy()
+    uvd.nsample_array = np.ones(uvd.data_array.shape, np.float32) if empty else template.nsample_array.copy()
     return uvd
 
 
@@ -121,16 +115,11 @@ def antenna_rows(uvd: UVData) -> np.ndarray:
 
 def baseline_vectors(uvd: UVData) -> np.ndarray:
     """Return x_b - x_a in east, north, up metres for each baseline (a, b), (Nbls, 3)."""
-    enu = uvd.telescope.get_enu_antpos()
-    first, second = antenna_indices(uvd).T
-    return enu[second] - enu[first]
+    return np.diff(uvd.telescope.get_enu_antpos()[antenna_indices(uvd)], axis=1)[:, 0]
 
 
 def use_bundled_earth_orientation() -> None:
-    """Prevent astropy from downloading Earth orientation tables, and let it use predictions of the installed ones.
-
-    Call it in every process that computes sidereal times or source positions.
-    """
+    """Let astropy use the installed tables of the Earth's orientation in this process, without downloads."""
     from astropy.utils import iers
 
     iers.conf.auto_download = False
@@ -188,7 +177,7 @@ def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndar
     """Return the observation of the template at other times (Julian dates) and frequencies (Hz)."""
     return new_observation(
         template.telescope.copy(),
-        np.column_stack([template.ant_1_array, template.ant_2_array])[: template.Nbls],
+        antenna_pairs(template),
         times=np.asarray(times_jd, dtype=float),
         frequencies=np.asarray(frequencies, dtype=float),
         resolution=(template.integration_time[0], template.channel_width[0]),
@@ -198,6 +187,4 @@ def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndar
 
 def channels_per_block(frequencies: np.ndarray, width: float) -> int:
     """Return how many channels, at least one, a block has that is `width` Hz wide; frequencies are in Hz."""
-    if len(frequencies) == 1:
-        return 1
-    return max(1, round(width / np.abs(np.diff(frequencies)).min()))
+    return max(1, round(width / np.abs(np.diff(frequencies)).min(initial=np.inf)))

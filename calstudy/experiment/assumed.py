@@ -41,10 +41,7 @@ def assumed_changes(assumed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the changes of `calibration.assumed` as one dotted path for each value.
 
     A block without `kind` is split into its fields, so that ``sky: {foregrounds: {count: 3}}`` is
-    ``sky.foregrounds.count: 3``; a block with a `kind` is a value, and so is an empty one.
-
-    Raises ExperimentError, with one sentence per fault, for a path that is not of the sky or the instrument or is given
-    twice, and for a file of visibilities besides other changes.
+    ``sky.foregrounds.count: 3``. Raises ExperimentError, with one sentence per fault.
     """
     found: dict[str, Any] = {}
     faults = []
@@ -75,8 +72,7 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
     The instrument is the nominal one, with changes: no calibrator knows `instrument.as_built`. A file of visibilities
     in `calibration.assumed` changes neither. Relative paths of plug-ins start at `folder`.
 
-    Raises ExperimentError, with one sentence per fault: see `assumed_changes`; fields that do not exist or have invalid
-    values; and channels, times or polarizations that are not those of the data.
+    Raises ExperimentError, with one sentence per fault, also if `OF_THE_DATA` would be changed.
     """
     changes = {path: value for path, value in assumed_changes(experiment.calibration.assumed).items() if "." in path}
     nominal = AssumedWorld(sky=experiment.sky, instrument=experiment.instrument.nominal())
@@ -89,12 +85,11 @@ def assumed_world(experiment: Experiment, folder: Path | None = None) -> Assumed
         world = AssumedWorld.model_validate(content, context={"folder": folder})
     except ValidationError as error:
         raise ExperimentError([f"{FIELD}.{sentence}" for sentence in sentences(error, AssumedWorld, content)]) from None
-    others = [name for name in OF_THE_DATA if getattr(world.instrument, name) != getattr(experiment.instrument, name)]
-    if others:
-        raise ExperimentError(
-            [
-                f"{FIELD}.instrument.{name}: must be that of the data, with which the sky model is compared"
-                for name in others
-            ]
-        )
+    faults = [
+        f"{FIELD}.instrument.{name}: must be that of the data, with which the sky model is compared"
+        for name in OF_THE_DATA
+        if getattr(world.instrument, name) != getattr(experiment.instrument, name)
+    ]
+    if faults:
+        raise ExperimentError(faults)
     return world

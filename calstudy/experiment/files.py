@@ -34,10 +34,9 @@ class _Loader(yaml.SafeLoader):
         keys: set[Any] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} is not a text", problem_mark=key_node.start_mark)
-            if key in keys:
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} appears twice", problem_mark=key_node.start_mark)
+            if not isinstance(key, str) or key in keys:
+                why = "appears twice" if isinstance(key, str) else "is not a text"
+                raise _refused(key_node, f"key {key!r} {why}")
             keys.add(key)
         return super().construct_mapping(node, deep)
 
@@ -52,51 +51,33 @@ for _side in (_Loader, _Dumper):
 OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
-def _whole_number(loader: _Loader, node: yaml.ScalarNode) -> int:
-    """Read a whole number; refuse texts that YAML 1.1 and a reader take for different numbers."""
-    text = str(node.value)
-    number = int(loader.construct_yaml_int(node))
-    if OCTAL.fullmatch(text):
-        hint = f"leave out the zero in front, or write {number} if that is meant"
-        raise yaml.MarkedYAMLError(
-            problem=f"{text} is an octal number in YAML, {number}; {hint}", problem_mark=node.start_mark
-        )
-    if ":" in text:
-        raise _base_60(node, number)
-    return number
-
-
-def _real_number(loader: _Loader, node: yaml.ScalarNode) -> float:
-    """Read a real number; refuse one to the base 60."""
-    number = float(loader.construct_yaml_float(node))
-    if ":" in str(node.value):
-        raise _base_60(node, number)
-    return number
-
-
-def _base_60(node: yaml.ScalarNode, number: float) -> yaml.MarkedYAMLError:
-    problem = f"{node.value} is a number to the base 60 in YAML, {number:g}; write a number with a unit, such as 6.4 h"
+def _refused(node: yaml.Node, problem: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+
+
+def _number(loader: _Loader, node: yaml.ScalarNode) -> float:
+    """Read a number; refuse texts that YAML 1.1 and a reader take for different numbers."""
+    text, whole = str(node.value), node.tag.endswith(":int")
+    number = loader.construct_yaml_int(node) if whole else loader.construct_yaml_float(node)
+    if whole and OCTAL.fullmatch(text):
+        hint = f"leave out the zero in front, or write {number} if that is meant"
+        raise _refused(node, f"{text} is an octal number in YAML, {number}; {hint}")
+    if ":" in text:
+        hint = "write a number with a unit, such as 6.4 h"
+        raise _refused(node, f"{text} is a number to the base 60 in YAML, {number:g}; {hint}")
+    return number
 
 
 def _date(loader: _Loader, node: yaml.ScalarNode) -> None:
     """Refuse a date, which no field takes: they are texts."""
     del loader
-    raise yaml.MarkedYAMLError(
-        problem=f"{node.value} is a date in YAML; write it in quotes", problem_mark=node.start_mark
-    )
+    raise _refused(node, f"{node.value} is a date in YAML; write it in quotes")
 
 
-def _unknown(loader: _Loader, node: yaml.Node) -> None:
-    """Refuse a tag that YAML knows and no field takes, as one that it does not know."""
-    loader.construct_undefined(node)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:timestamp", _date)
-for _kind in ("binary", "set", "omap", "pairs"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _unknown)
-_Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
-_Loader.add_constructor("tag:yaml.org,2002:float", _real_number)
+# Tags that YAML knows and no field takes are refused as those that it does not know.
+_CONSTRUCTORS = dict.fromkeys(("binary", "set", "omap", "pairs"), _Loader.construct_undefined)
+for _kind, _read in {**_CONSTRUCTORS, "timestamp": _date, "int": _number, "float": _number}.items():
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _read)
 
 
 KINDS_OF_YAML: dict[type, str] = {list: "a list", str: "a text", int: "a number", float: "a number", bool: "a word"}
@@ -165,9 +146,8 @@ def parse_override(text: str) -> tuple[str, Any]:
 def override(data: Mapping[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a copy of `data`, the content of an experiment file, with the field at the dotted path set to `value`.
 
-    Items of a list are counted from 0: ``corruption.effects.0.sigma``. A list that is missing in the data, or a mapping
-    of names such as ``variants``, starts as the default of an experiment. Keys of the data may themselves be dotted
-    paths, as those of ``calibration.assumed`` are.
+    A list that is missing in the data, or a mapping of names such as ``variants``, starts as the default of an
+    experiment; for the rest see `with_value`.
     """
     return with_value(data, path, value, _block_for)
 
@@ -207,12 +187,18 @@ def apply_scale(data: Mapping[str, Any], scale: str | None) -> dict[str, Any]:
     """Return `data` with the overrides of the named scale applied; raises InputError if the file has no such scale."""
     if scale is None:
         return dict(data)
-    scales = data.get("scales") or {}
-    if not isinstance(scales, dict) or not isinstance(scales.get(scale), dict):
-        names = [name for name in scales if isinstance(scales[name], dict)] if isinstance(scales, dict) else []
-        listed = f"the file has: {', '.join(names)}" if names else "the file has no scales"
-        raise InputError(f"--scale {scale}: not a scale of this experiment{nearest(scale, names)} ({listed})")
+    scales = _scales(data)
+    if scale not in scales:
+        listed = f"the file has: {', '.join(scales)}" if scales else "the file has no scales"
+        raise InputError(f"--scale {scale}: not a scale of this experiment{nearest(scale, list(scales))} ({listed})")
     return overridden(data, scales[scale])
+
+
+def _scales(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    scales = data.get("scales")
+    return (
+        {name: found for name, found in scales.items() if isinstance(found, dict)} if isinstance(scales, dict) else {}
+    )
 
 
 def require_scales(
@@ -222,13 +208,12 @@ def require_scales(
 
     `valid` are scales, or None, that are known to be valid.
     """
-    scales = content["scales"] if isinstance(content.get("scales"), dict) else {}
     faults: list[str] = []
-    for name in (None, *(name for name, changes in scales.items() if isinstance(changes, dict))):
-        if not scales or name in valid:
-            continue
+    names = _scales(content)
+    for name in (None, *names) if names else ():
         try:
-            check(name)
+            if name not in valid:
+                check(name)
         except InputError as error:
             if name is None:
                 return  # The faults of the file itself are reported first.
@@ -243,22 +228,22 @@ def _require_known_antennas(
 ) -> None:
     """Raise ExperimentError if `named`, or a set of antennas with another beam, has an antenna that does not exist."""
     count = antenna_count(instrument.layout)
+    built = instrument.as_built
+    dead = built.dipoles.dead
+    blocks: Mapping[str, Mapping[str, Any]] = {"antenna_beams": instrument.antenna_beams, "as_built.dipoles.dead": dead}
     groups = {
-        f"{prefix}instrument.antenna_beams.{name}.antennas": group.antennas
-        for name, group in instrument.antenna_beams.items()
-    } | {
-        f"{prefix}instrument.as_built.dipoles.dead.{name}.antennas": tiles.antennas
-        for name, tiles in instrument.as_built.dipoles.dead.items()
+        f"{prefix}instrument.{field}.{name}.antennas": group.antennas
+        for field, found in blocks.items()
+        for name, group in found.items()
     }
-    if instrument.as_built.beams.swapped:
-        groups[f"{prefix}instrument.as_built.beams.swapped"] = instrument.as_built.beams.swapped
+    groups[f"{prefix}instrument.as_built.beams.swapped"] = built.beams.swapped
     faults = [
         f"{field}: names antenna {max(places)}, but the layout has {count} antennas, counted from 0"
         for field, places in {**named, **groups}.items()
-        if max(places) >= count
+        if max(places, default=-1) >= count
     ]
     without = [model_of(beam) for beam in nominal_beams(instrument) if not model_of(beam).dipoles]
-    if instrument.as_built.dipoles.differ and without:
+    if built.dipoles.differ and without:
         field = f"{prefix}instrument.as_built.dipoles"
         faults.append(f"{field}: the beam {without[0].label!r} has no dipoles; use 'mwa-embedded-element'")
     if faults:
@@ -284,8 +269,7 @@ def _resolve_assumed(experiment: Experiment, base: Path) -> Experiment:
 def checked(model: type[M], data: Mapping[str, Any], base: Path, prefix: str = "", files: bool = True) -> M:
     """Return the content of a file as a section; relative paths of plug-ins and input files start at the folder `base`.
 
-    Input files must exist if `files`. Raises ExperimentError with one sentence per fault: the dotted path of the field,
-    after the prefix, the value, and the allowed values.
+    Input files must exist if `files`. Raises ExperimentError with one sentence per fault, after the prefix.
     """
     try:
         return model.model_validate(dict(data), context={"folder": base, "files": files})
@@ -303,10 +287,7 @@ def validate(data: Mapping[str, Any], base: Path) -> Experiment:
 
 @dataclass(frozen=True)
 class StudyFile:
-    """The content of a file, and the scale and the ``path=value`` overrides of the command line, not yet applied.
-
-    Relative paths start at the folder of the file, or at `base` if it is given.
-    """
+    """The content of a file, and the scale and the ``path=value`` overrides of the command line, not yet applied."""
 
     path: Path
     content: Mapping[str, Any]
@@ -322,7 +303,7 @@ class StudyFile:
 
     @property
     def folder(self) -> Path:
-        """The folder where relative paths start."""
+        """The folder where relative paths start: that of the file, or `base`."""
         return self.base or self.path.resolve().parent
 
     def changed(self) -> dict[str, Any]:
@@ -354,10 +335,7 @@ class StudyFile:
 
 
 def with_absolute_paths(content: Any, read: Iterable[BaseModel], folder: Path) -> Any:
-    """Return the content of a file with absolute paths of plug-ins and input files, which start at a folder.
-
-    What was `read` from the content says which of its texts are paths.
-    """
+    """Return the content of a file with absolute paths, from a folder, of all files in what was `read` from it."""
     used = {text for item in read for text in texts(item.model_dump(mode="json")) if text.startswith("/")}
 
     def absolute(value: Any, at: str = "") -> Any:

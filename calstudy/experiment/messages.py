@@ -49,34 +49,25 @@ def _locate(root: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str
     path: list[str] = []
     members: list[Any] = [root]
     holder: type[BaseModel] | None = None
-    for step in location:
-        if len([member for member in members if member is not NoneType]) > 1:
+    for step in map(str, location):
+        members = [member for member in members if member is not NoneType]
+        if len(members) > 1:
             members = []  # The step is pydantic's name of one of several types.
             continue
-        models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
-        holder = models[0] if models else None
-        path.append(str(step))
-        if holder is not None:
-            field = holder.model_fields.get(str(step))
-            members = alternatives(field.annotation) if field else []
+        path.append(step)
+        holder = next((kind for kind in members if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+        if holder is None:
+            members = [item for member in members for item in _items(member)]
         else:
-            members = _items(members[0]) if members else []
+            members = alternatives(holder.model_fields[step].annotation) if step in holder.model_fields else []
     return ".".join(path), holder
-
-
-def _written(data: Any, path: str) -> str:
-    """Return the value at the dotted path as the file has it."""
-    value = value_at(data, path, {})
-    if value is None:
-        return " (empty)"
-    return f" = {value!r}" if not isinstance(value, dict | list) else ""
 
 
 def _unit(holder: type[BaseModel] | None, field: int | str) -> str:
     """Return the unit of a field's bounds, or an empty string."""
     info = holder.model_fields.get(str(field)) if holder else None
     extra = info.json_schema_extra if info else None
-    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
+    return str(extra.get("unit", "")) if isinstance(extra, dict) else ""
 
 
 def _bound(number: float, unit: str) -> str:
@@ -117,7 +108,9 @@ def _sentence(root: type[BaseModel], error: Any, data: Any, prefix: str, kinds: 
     if kind in ("too_short", "too_long"):
         bound = f"at least {context['min_length']}" if kind == "too_short" else f"at most {context['max_length']}"
         return f"{path}: must have {bound} item(s), has {context['actual_length']}"
-    return f"{path}{_written(data, inner)}: {_wanted(error, holder)}"
+    value = value_at(data, inner, {})
+    written = " (empty)" if value is None else "" if isinstance(value, dict | list) else f" = {value!r}"
+    return f"{path}{written}: {_wanted(error, holder)}"
 
 
 def _wanted(error: Any, holder: type[BaseModel] | None) -> str:
@@ -139,17 +132,15 @@ def _wanted(error: Any, holder: type[BaseModel] | None) -> str:
     return str(error["msg"])
 
 
-def _is_inside(location: tuple[int | str, ...], above: tuple[int | str, ...]) -> bool:
-    return len(location) > len(above) and location[: len(above)] == above
-
-
 def _all(
     error: ValidationError, root: type[BaseModel], data: Any, prefix: str, kinds: Kinds[Any] | None = None
 ) -> Iterator[str]:
     found = error.errors()
     for item in found:
         # A list is too short for pydantic if one of its items is wrong, which has a sentence of its own.
-        if item["type"] == "too_short" and any(_is_inside(other["loc"], item["loc"]) for other in found):
+        above = item["loc"]
+        inside = (other["loc"] for other in found if other["loc"] != above and other["loc"][: len(above)] == above)
+        if item["type"] == "too_short" and any(inside):
             continue
         if item["type"] == NESTED:
             path, context = f"{prefix}{_locate(root, item['loc'])[0]}.", item["ctx"]
@@ -159,9 +150,5 @@ def _all(
 
 
 def sentences(error: ValidationError, root: type[BaseModel], data: Any) -> list[str]:
-    """Return one sentence per fault that pydantic found in `data`, in terms of the file.
-
-    `error` is from validating `data`, the file's content as plain dictionaries and lists, with `root`, the model of the
-    whole file.
-    """
+    """Return one sentence per fault that pydantic found in `data`, the content of a file, as the model `root`."""
     return list(dict.fromkeys(_all(error, root, data, "")))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -220,66 +222,6 @@ class Experiment(Section):
     )
     scales: Scales = Field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _variants_have_their_components(self) -> Experiment:
-        for name, variant in self.variants.items():
-            if "noise" in variant.components and self.corruption.noise.kind == "none":
-                raise fault(f"variants.{name}.components", "asks for noise, but corruption.noise is 'none'")
-            if "foregrounds" in variant.components and not self.sky.has_foregrounds:
-                raise fault(f"variants.{name}.components", "asks for foregrounds, but sky.foregrounds is 'none'")
-            if not VARIANT_NAME.fullmatch(name) or name == "transfer":
-                raise fault(f"variants.{name}", "is not a usable name: use letters, digits, '_', '-'; not 'transfer'")
-        return self
-
-    @model_validator(mode="after")
-    def _what_needs_noise_has_it(self) -> Experiment:
-        if self.corruption.noise.kind != "none":
-            return self
-        if self.calibration.needs_noise:
-            raise fault(
-                "corruption.noise",
-                "is 'none', and the finite deviations of calibration.foreground_prior are weighed against noise: give "
-                "calibration.foreground_prior.noise, or let there be noise",
-            )
-        if self.calibration.needs_autos:
-            raise fault(
-                "calibration.weights",
-                "is 'autos', and without corruption.noise there are no autocorrelations: choose other weights, or let "
-                "there be noise",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _antennas_and_effects_are_independent(self) -> Experiment:
-        # All are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
-        noise = self.corruption.noise
-        even_and_odd, twins = getattr(noise, "seeds", ()), getattr(noise, "seeds_without_eor", None) or ()
-        if any(seed in twins and twins.index(seed) != place for place, seed in enumerate(even_and_odd)):
-            raise fault(
-                "corruption.noise.seeds_without_eor", "has the seed of even data where seeds has that of odd data"
-            )
-        built = self.instrument.as_built.drawn_seeds
-        drawn: list[tuple[str, int | None]] = [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
-        drawn += [("corruption.noise", seed) for seed in {*even_and_odd, *twins}]
-        for place, effect in enumerate(self.corruption.effects):
-            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
-            drawn.append((f"corruption.effects.{place}.seed", own))
-            if drift is not None and isinstance(stream := drift.stream(own), int):
-                drawn.append((f"corruption.effects.{place}.drift.seed", stream))
-        for number, (path, seed) in enumerate(drawn):
-            for other, its in drawn[:number]:
-                # Effects are compared with each other, and with their drifts, by `CorruptionSettings`.
-                if seed == its is not None and not (other.startswith("corruption.effects") or other == path):
-                    raise fault(path, f"is {seed}, as that of {other}: give one of them another")
-        return self
-
-    @model_validator(mode="after")
-    def _foregrounds_and_eor_are_independent(self) -> Experiment:
-        diffuse, eor = self.sky.diffuse, self.sky.eor
-        if isinstance(diffuse, SyntheticDiffuse) and eor.spectrum != "flat" and diffuse.seed == eor.seed:
-            raise fault("sky.diffuse.seed", f"is {diffuse.seed}, as that of sky.eor: give one of them another")
-        return self
-
     @property
     def calibrates(self) -> bool:
         """Whether any variant is calibrated."""
@@ -300,75 +242,116 @@ class Experiment(Section):
         )
 
     @model_validator(mode="after")
-    def _figures_and_tables_can_be_made(self) -> Experiment:
-        self._require_possible("figures", "picture", FIGURE_NAME)
-        self._require_possible("tables", "table", TABLE_NAME)
-        count = self.instrument.times.count
-        if self.outputs.inspect.integration >= count:
-            raise fault(
-                "outputs.inspect.integration",
-                f"{self.outputs.inspect.integration} is not among the {count} integrations, counted from 0",
-            )
+    def _parts_fit_together(self) -> Experiment:
+        # Each fault is the dotted path of a field, and a sentence.
+        faults = chain(
+            self._faults_of_variants(),
+            self._faults_of_settings(),
+            self._faults_of_seeds(),
+            self._faults_of_autos(),
+            self._faults_of_things("figures", "picture", FIGURE_NAME),
+            self._faults_of_things("tables", "table", TABLE_NAME),
+        )
+        if (found := next(faults, None)) is not None:
+            raise fault(*found)
         return self
 
-    def _require_possible(self, field: str, what: str, names: re.Pattern[str]) -> None:
-        """Raise a fault if a figure or table that is asked for has no usable name, or refuses the experiment."""
+    def _faults_of_variants(self) -> Iterator[tuple[str, str]]:
+        lacking = {"noise": self.corruption.noise.kind == "none", "foregrounds": not self.sky.has_foregrounds}
+        fields = {"noise": "corruption.noise", "foregrounds": "sky.foregrounds"}
+        for name, variant in self.variants.items():
+            for part in fields:
+                if part in variant.components and lacking[part]:
+                    yield f"variants.{name}.components", f"asks for {part}, but {fields[part]} is 'none'"
+            if not VARIANT_NAME.fullmatch(name) or name == "transfer":
+                yield f"variants.{name}", "is not a usable name: use letters, digits, '_', '-'; not 'transfer'"
+
+    def _faults_of_seeds(self) -> Iterator[tuple[str, str]]:
+        # All are drawn by NumPy's default generator from the seed alone: equal seeds draw the same numbers.
+        noise, diffuse, eor = self.corruption.noise, self.sky.diffuse, self.sky.eor
+        even_and_odd, twins = getattr(noise, "seeds", ()), getattr(noise, "seeds_without_eor", None) or ()
+        if any(seed in twins and twins.index(seed) != place for place, seed in enumerate(even_and_odd)):
+            yield "corruption.noise.seeds_without_eor", "has the seed of even data where seeds has that of odd data"
+        built = self.instrument.as_built.drawn_seeds
+        drawn: list[tuple[str, int | None]] = [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
+        drawn += [("corruption.noise", seed) for seed in {*even_and_odd, *twins}]
+        for place, effect in enumerate(self.corruption.effects):
+            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
+            drawn.append((f"corruption.effects.{place}.seed", own))
+            if drift is not None and isinstance(stream := drift.stream(own), int):
+                drawn.append((f"corruption.effects.{place}.drift.seed", stream))
+        for (other, its), (path, seed) in combinations(drawn, 2):
+            # Effects are compared with each other, and with their drifts, by `CorruptionSettings`.
+            if seed == its is not None and not (other.startswith("corruption.effects") or other == path):
+                yield path, f"is {seed}, as that of {other}: give one of them another"
+        if isinstance(diffuse, SyntheticDiffuse) and eor.spectrum != "flat" and diffuse.seed == eor.seed:
+            yield "sky.diffuse.seed", f"is {diffuse.seed}, as that of sky.eor: give one of them another"
+
+    def _faults_of_things(self, field: str, what: str, names: re.Pattern[str]) -> Iterator[tuple[str, str]]:
         labels: list[str] = []
         for index, thing in enumerate(getattr(self.outputs, field)):
             path = f"outputs.{field}.{index}"
             if not names.fullmatch(thing.label) or thing.label in labels:
-                raise fault(path, f"{thing.label!r} cannot name a {what}, or does so already: use another file name")
+                yield path, f"{thing.label!r} cannot name a {what}, or does so already: use another file name"
             labels.append(thing.label)
             try:
                 with guarded(thing):
                     refusal = thing.refusal(self)
             except InputError as error:
-                raise fault(path, str(error)) from None
-            if refusal is not None:
-                raise fault(f"outputs.{field}", f"asks for {thing.label!r}, which {refusal}")
+                yield path, str(error)
+            else:
+                if refusal is not None:
+                    yield f"outputs.{field}", f"asks for {thing.label!r}, which {refusal}"
 
-    @model_validator(mode="after")
-    def _levels_have_their_reference(self) -> Experiment:
-        if not self.sky.has_foregrounds:
-            if self.corruption.eor_level is not None:
-                raise fault(
-                    "corruption.eor_level", "is relative to foregrounds, but sky.foregrounds is 'none': use null"
-                )
-            if self.corruption.noise.kind == "times-foregrounds":
-                raise fault("corruption.noise", "is relative to foregrounds, but sky.foregrounds is 'none'")
-        return self
+    def _faults_of_settings(self) -> Iterator[tuple[str, str]]:
+        noise, channels, count = self.corruption.noise.kind, self.instrument.channels, self.instrument.times.count
+        integration, together = self.outputs.inspect.integration, self.calibration.integrations_per_solve
+        last = channels.first + (channels.count - 1) * channels.width
+        without = "is relative to foregrounds, but sky.foregrounds is 'none'"
+        silent, empty = noise == "none", not self.sky.has_foregrounds
+        refused = (
+            (
+                silent and self.calibration.needs_noise,
+                "corruption.noise",
+                "is 'none', and the finite deviations of calibration.foreground_prior are weighed against noise: give "
+                "calibration.foreground_prior.noise, or let there be noise",
+            ),
+            (
+                silent and self.calibration.needs_autos,
+                "calibration.weights",
+                "is 'autos', and without corruption.noise there are no autocorrelations: choose other weights, or let "
+                "there be noise",
+            ),
+            (
+                integration >= count,
+                "outputs.inspect.integration",
+                f"{integration} is not among the {count} integrations, counted from 0",
+            ),
+            (empty and self.corruption.eor_level is not None, "corruption.eor_level", f"{without}: use null"),
+            (empty and noise == "times-foregrounds", "corruption.noise", without),
+            (
+                together > count and self.calibrates,
+                "calibration.integrations_per_solve",
+                f"{together} integrations cannot be solved together, for instrument.times.count is {count}; use at "
+                f"most {count}",
+            ),
+            (
+                last >= HYDROGEN_LINE,
+                "instrument.channels",
+                f"end at {last / 1e6:g} MHz, above the 21 cm line at redshift zero",
+            ),
+        )
+        yield from ((path, sentence) for applies, path, sentence in refused if applies)
 
-    @model_validator(mode="after")
-    def _autocorrelations_are_of_the_antennas(self) -> Experiment:
+    def _faults_of_autos(self) -> Iterator[tuple[str, str]]:
         beam = self.instrument.beam
-        if beam.is_built_in and beam.label.startswith("mwa-"):
-            return self
-        for place, effect in enumerate(self.corruption.effects):
+        own = beam.is_built_in and beam.label.startswith("mwa-")
+        for place, effect in enumerate(() if own else self.corruption.effects):
             autos = getattr(effect, "autos", None)
             # The value alone does not tell a default from the same number given on purpose.
             if isinstance(autos, Autocorrelations) and "effective_area" not in autos.model_fields_set:
-                raise fault(
+                yield (
                     f"corruption.effects.{place}.autos.effective_area",
                     f"must be given with the beam {beam.label!r}, such as 100 m2: the default, "
                     f"{autos.effective_area:g} m2, is that of an MWA tile; or autos: null, for no autocorrelations",
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _solves_fit_in_the_run(self) -> Experiment:
-        together, count = self.calibration.integrations_per_solve, self.instrument.times.count
-        if together > count and self.calibrates:
-            raise fault(
-                "calibration.integrations_per_solve",
-                f"{together} integrations cannot be solved together, for instrument.times.count is {count}; use at "
-                f"most {count}",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _channels_see_the_21_cm_line(self) -> Experiment:
-        channels = self.instrument.channels
-        last = channels.first + (channels.count - 1) * channels.width
-        if last >= HYDROGEN_LINE:
-            raise fault("instrument.channels", f"end at {last / 1e6:g} MHz, above the 21 cm line at redshift zero")
-        return self

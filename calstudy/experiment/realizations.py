@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import Any
 
 from calstudy.base.errors import ExperimentError, InputError
@@ -37,15 +39,12 @@ class Realization:
 def expand_realizations(experiment: Experiment) -> list[Realization]:
     """Return the realizations of all blocks, each once: first the experiment itself, then those of block after block.
 
-    Raises InputError if the experiment has no realizations, and ExperimentError, with one sentence per fault, for a
-    sweep besides, variants without signal loss, and parts that cannot be drawn, are drawn in two blocks, or whose seeds
-    would coincide.
+    Raises InputError if the experiment has none, and ExperimentError, with one sentence per fault, if it cannot.
     """
     blocks = experiment.realizations
     if not blocks:
         raise InputError(f"{experiment.name}: has no realizations")
-    faults = _faults(experiment)
-    if faults:
+    if faults := _faults(experiment):
         raise ExperimentError(faults)
     base = experiment.with_defaults("realizations", "scales")
     found = [Realization(dict.fromkeys(PARTS, 0), base)]
@@ -60,29 +59,27 @@ def expand_realizations(experiment: Experiment) -> list[Realization]:
 
 def members(experiment: Experiment) -> list[list[int]]:
     """Return the indices of each block's realizations in `expand_realizations`; the first is in all blocks."""
-    found, first = [], 1
-    for block in experiment.realizations:
-        found.append([0, *range(first, first + block.count - 1)])
-        first += block.count - 1
-    return found
+    ends = list(accumulate((block.count - 1 for block in experiment.realizations), initial=1))
+    return [[0, *range(first, end)] for first, end in pairwise(ends)]
 
 
 def _drawn(experiment: Experiment, draws: Mapping[str, int]) -> Experiment:
     """Return the experiment with the seeds of some draws."""
     sky, corruption = experiment.sky, experiment.corruption
     eor = sky.eor.model_copy(update={"seed": sky.eor.seed + SEED_STEP * draws["eor"]})
-    changes: dict[str, Any] = {
-        "effects": tuple(_with_gains_drawn(effect, SEED_STEP * draws["gains"]) for effect in corruption.effects)
+    seeds = _noise_seeds(experiment)
+    moved = {name: tuple(seed + SEED_STEP * draws["noise"] for seed in found) for name, found in seeds.items()}
+    changes = {
+        "effects": tuple(_with_gains_drawn(effect, SEED_STEP * draws["gains"]) for effect in corruption.effects),
+        "noise": corruption.noise.model_copy(update=moved),
     }
-    if not isinstance(corruption.noise, NoNoise):
-        noise = corruption.noise
-        seeds = {"seeds": noise.seeds, "seeds_without_eor": noise.seeds_without_eor}
-        moved = {
-            name: tuple(seed + SEED_STEP * draws["noise"] for seed in found) for name, found in seeds.items() if found
-        }
-        changes["noise"] = noise.model_copy(update=moved)
     update = {"sky": sky.model_copy(update={"eor": eor}), "corruption": corruption.model_copy(update=changes)}
     return experiment.model_copy(update=update)
+
+
+def _noise_seeds(experiment: Experiment) -> dict[str, tuple[int, ...]]:
+    noise = experiment.corruption.noise
+    return {name: found for name in ("seeds", "seeds_without_eor") if (found := getattr(noise, name, None))}
 
 
 def _gain_seed(effect: Any) -> int | None:
@@ -112,9 +109,9 @@ def _faults(experiment: Experiment) -> list[str]:
         names = ", ".join(SIGNAL_LOSS_VARIANTS)
         faults.append(f"realizations: pool the signal loss, which needs the variants {names}")
     faults += [
-        f"realizations: draw {part!r} in {drawn.count(part)} blocks; each part can be drawn in one block only"
-        for part in dict.fromkeys(drawn)
-        if drawn.count(part) > 1
+        f"realizations: draw {part!r} in {count} blocks; each part can be drawn in one block only"
+        for part, count in Counter(drawn).items()
+        if count > 1
     ]
     if "noise" in drawn and isinstance(experiment.corruption.noise, NoNoise):
         faults.append("realizations: draw 'noise', but corruption.noise is 'none'")
@@ -122,52 +119,40 @@ def _faults(experiment: Experiment) -> list[str]:
         faults.append(
             "realizations: draw 'gains', but no effect on the gains in corruption.effects, nor a drift, has a seed"
         )
-    return faults or _seeds_of_skies(experiment) or _coinciding_seeds(experiment)
-
-
-def _seeds_of_skies(experiment: Experiment) -> list[str]:
-    """Return a sentence if the EoR of a realization would have the random numbers of diffuse emission."""
-    diffuse, eor = experiment.sky.diffuse, experiment.sky.eor
-    count = max([block.count for block in experiment.realizations if "eor" in block.draw], default=1)
-    if not isinstance(diffuse, SyntheticDiffuse) or eor.spectrum == "flat":
-        return []
-    if diffuse.seed not in range(eor.seed, eor.seed + SEED_STEP * count, SEED_STEP):
-        return []
-    return [
-        f"realizations: the seed {diffuse.seed} would be used for sky.diffuse and for the EoR (seeds grow by "
-        f"{SEED_STEP} from one realization to the next); choose another in sky.diffuse"
-    ]
+    return faults or _coinciding_seeds(experiment)
 
 
 def _coinciding_seeds(experiment: Experiment) -> list[str]:
-    """Return a sentence if gains or noise of a realization would have random numbers of another, or of other draws."""
-    counts: dict[str, int] = {part: block.count for block in experiment.realizations for part in block.draw}
-    noise = experiment.corruption.noise
-    bases: list[tuple[str, int]] = [
-        ("gains", seed) for effect in experiment.corruption.effects if (seed := _gain_seed(effect)) is not None
-    ]
-    bases += [
-        ("noise", seed)
-        for seed in (() if isinstance(noise, NoNoise) else (*noise.seeds, *(noise.seeds_without_eor or ())))
-    ]
+    """Return a sentence if something that is drawn would have random numbers of another realization, or other draws."""
+    counts = {
+        "the EoR" if part == "eor" else part: block.count for block in experiment.realizations for part in block.draw
+    }
+    diffuse, eor = experiment.sky.diffuse, experiment.sky.eor
+    # Those of skies and of data are of different generators.
+    skies: list[tuple[str, int]] = []
+    if isinstance(diffuse, SyntheticDiffuse) and eor.spectrum != "flat":
+        skies = [("sky.diffuse", diffuse.seed), ("the EoR", eor.seed)]
+    seeds = [(effect, _gain_seed(effect)) for effect in experiment.corruption.effects]
+    bases = [("gains", seed) for _, seed in seeds if seed is not None]
+    bases += [("noise", seed) for found in _noise_seeds(experiment).values() for seed in found]
     # What no realization draws again.
     built = experiment.instrument.as_built.drawn_seeds
     bases += [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
     bases += [
-        (f"corruption.effects.{place}", seed)
-        for place, effect in enumerate(experiment.corruption.effects)
-        if _gain_seed(effect) is None and (seed := getattr(effect, "seed", None)) is not None
+        (f"corruption.effects.{place}", own)
+        for place, (effect, seed) in enumerate(seeds)
+        if seed is None and (own := getattr(effect, "seed", None)) is not None
     ]
-    seen: dict[int, str] = {}
-    for part, base in bases:
-        for number in range(counts.get(part, 1)):
-            seed = base + SEED_STEP * number
-            if seed in seen:
-                return [
-                    f"realizations: the seed {seed} would be used for {seen[seed]} and for {part} (seeds grow by "
-                    f"{SEED_STEP} from one realization to the next); choose other seeds in corruption"
-                ]
-            seen[seed] = part
+    for found, where in ((skies, "sky.diffuse"), (bases, "corruption")):
+        seen: dict[int, str] = {}
+        for part, base in found:
+            for seed in range(base, base + SEED_STEP * counts.get(part, 1), SEED_STEP):
+                if seed in seen:
+                    return [
+                        f"realizations: the seed {seed} would be used for {seen[seed]} and for {part} (seeds grow by "
+                        f"{SEED_STEP} from one realization to the next); choose other seeds in {where}"
+                    ]
+                seen[seed] = part
     return []
 
 

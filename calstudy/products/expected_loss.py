@@ -12,6 +12,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.files import json_number
+from calstudy.base.kept_arrays import read_arrays
 from calstudy.base.resources import LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import antenna_pairs, rows_of, to_cube
 from calstudy.calibrate.cost import PAPER_SAMPLES
@@ -33,7 +34,6 @@ from calstudy.products.files import (
     MODEL,
     SOLUTION,
     integration_times,
-    read_arrays,
     read_json,
     read_visibilities,
     write_json,

@@ -84,12 +84,6 @@ def write_visibilities(uvd: UVData, path: Path, single: bool = False) -> None:
     uvd.write_uvh5(path, data_write_dtype=np.dtype(np.complex64 if single else np.complex128), chunks=None)
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an npz file."""
-    with np.load(path, allow_pickle=False) as file:
-        return dict(file)
-
-
 def read_json(path: Path) -> Any:
     """Read a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))

@@ -11,6 +11,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import ErrorsOfFile, write_gain_errors
+from calstudy.base.kept_arrays import read_arrays
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import positions, to_cube
 from calstudy.calibrate.agreement import GainCoverage, pulls
@@ -23,7 +24,7 @@ from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
 from calstudy.products import calibration, corruption, observed
 from calstudy.products.calibration import Calibrated, prepared_fit, read_result
-from calstudy.products.files import GAINS, read_arrays, write_json
+from calstudy.products.files import GAINS, write_json
 from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 

@@ -13,6 +13,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -23,7 +24,7 @@ import numpy as np
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import read_gain_errors
-from calstudy.base.kept_arrays import DAMAGE
+from calstudy.base.kept_arrays import DAMAGE, read_arrays
 from calstudy.base.table import Table, from_json
 from calstudy.calibrate.agreement import Statistic
 from calstudy.calibrate.agreement import from_json as statistics_from_json
@@ -58,12 +59,15 @@ if TYPE_CHECKING:
     import xarray
 
 
-Spectrum = TypeVar("Spectrum", SphericalSpectrum, CylindricalSpectrum)
 Read = TypeVar("Read")
 NO_SCORES = "the run has no scores of its calibration, or is of a version that wrote none"
+NO_TRANSFER = "the run does not calibrate the same data with the EoR and without"
 
 
-def _undamaged(path: Path, read: Callable[[Path], Read], remedy: str = "run the experiment again") -> Read:
+AGAIN = "run the experiment again"
+
+
+def _undamaged(path: Path, read: Callable[[Path], Read], remedy: str = AGAIN) -> Read:
     """Read a file of a run; raises InputError, with what can be done, if its content is not that of a run."""
     try:
         return read(path)
@@ -87,30 +91,30 @@ class Tables:
 
     def transfer(self, region: str) -> TransferFunction:
         """Return the transfer function of the calibration, "outside-wedge" or "inside-wedge"."""
-        return self._loaded(self._transfer(TRANSFER, region), TransferFunction)
+        return self._loaded(spectrum_file(TRANSFER, region), NO_TRANSFER, TransferFunction)
 
     def transfer_in_bands(self, region: str) -> TransferFunction:
         """Return the transfer function in bands of k, "outside-wedge" or "inside-wedge"."""
-        return self._loaded(self._transfer(TRANSFER_BANDS, region), TransferFunction)
+        return self._loaded(spectrum_file(TRANSFER_BANDS, region), NO_TRANSFER, TransferFunction)
 
     @property
     def expected_transfer(self) -> ExpectedBins:
         """The transfer function that theory expects of the fit."""
-        return self._loaded(self.path(EXPECTED, "the run has no expected transfer function"), ExpectedBins)
+        return self._loaded(EXPECTED, "the run has no expected transfer function", ExpectedBins)
 
     def transfer_map(self) -> TransferMap:
         """Return the transfer function by baseline length and delay."""
-        return self._loaded(self._transfer(TRANSFER, "wedge"), TransferMap)
+        return self._loaded(spectrum_file(TRANSFER, "wedge"), NO_TRANSFER, TransferMap)
 
     @property
     def score(self) -> Score:
         """The scores of the calibration in bins of k, with errors from leaving out antennas."""
-        return self._loaded(self.path(SCORE_BINS, NO_SCORES), Score)
+        return self._loaded(SCORE_BINS, NO_SCORES, Score)
 
     @property
     def score_in_bands(self) -> Score:
         """The scores of the calibration in bands of k, likewise."""
-        return self._loaded(self.path(SCORE_BANDS, NO_SCORES), Score)
+        return self._loaded(SCORE_BANDS, NO_SCORES, Score)
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -148,15 +152,11 @@ class Tables:
             raise Unevaluated(missing)
         return found
 
-    def _transfer(self, name: str, kind: str) -> Path:
-        return self.path(spectrum_file(name, kind), "the run does not calibrate the same data with the EoR and without")
+    def _spectrum(self, variant: str, kind: str, cls: type[Stored]) -> Stored:
+        return self._loaded(spectrum_file(variant, kind), f"the run has no variant {variant!r}", cls)
 
-    def _spectrum(self, variant: str, kind: str, cls: type[Spectrum]) -> Spectrum:
-        return self._loaded(self.path(spectrum_file(variant, kind), f"the run has no variant {variant!r}"), cls)
-
-    @staticmethod
-    def _loaded(path: Path, kind: type[Stored]) -> Stored:
-        return _undamaged(path, lambda found: load_spectrum(found, kind))
+    def _loaded(self, name: str, missing: str, kind: type[Stored]) -> Stored:
+        return _undamaged(self.path(name, missing), lambda found: load_spectrum(found, kind))
 
 
 @dataclass(frozen=True)
@@ -173,10 +173,9 @@ class Results(Tables):
     @property
     def redundant_fraction(self) -> float | None:
         """Part of the baselines that have a redundant partner; None if nothing was calibrated."""
-        try:
+        with suppress(Unevaluated):
             return float(self.agreement["redundant_fraction"])
-        except Unevaluated:
-            return None
+        return None
 
     @property
     def sky_model_error(self) -> float:
@@ -194,10 +193,7 @@ COORDINATES = ("k", "baseline_length", "k_perp", *OF_DELAY, "horizon_delay")
 
 
 def by_wavenumber(spectrum: SphericalSpectrum | TransferFunction | Score) -> xarray.Dataset:
-    """Return quantities in bins of |k| with the coordinates `k`, `k_from` and `k_to`, h/Mpc.
-
-    Numbers that hold for all bins, such as the flux scale, are attributes.
-    """
+    """Return quantities in bins of |k|, with coordinates `k`, `k_from` and `k_to`, h/Mpc, and numbers as attributes."""
     arrays = {item.name: (("k",), getattr(spectrum, item.name)) for item in _arrays(spectrum)}
     edges = spectrum.bin_edges
     arrays |= {"k_from": (("k",), edges[:-1]), "k_to": (("k",), edges[1:])}
@@ -227,15 +223,18 @@ def _dataset(
     import xarray
 
     fields = {item.name: item for item in dataclasses.fields(spectrum)}  # type: ignore[arg-type]
-    edges = fields["bin_edges"].metadata["unit"]
-    units = {name: fields[name].metadata["unit"] if name in fields else edges for name in arrays}
-    variables = {name: xarray.Variable(dims, values, {"units": units[name]}) for name, (dims, values) in arrays.items()}
-    single = {name: getattr(spectrum, name) for name in fields if name not in arrays and name != "bin_edges"}
-    return xarray.Dataset(
-        {name: value for name, value in variables.items() if name not in coordinates},
-        {name: value for name, value in variables.items() if name in coordinates},
-        {name: value for name, value in single.items() if np.ndim(value) == 0},
+    found = xarray.Dataset(
+        {
+            name: (dims, values, {"units": fields.get(name, fields["bin_edges"]).metadata["unit"]})
+            for name, (dims, values) in arrays.items()
+        },
+        attrs={
+            name: value
+            for name in fields
+            if name not in (*arrays, "bin_edges") and np.ndim(value := getattr(spectrum, name)) == 0
+        },
     )
+    return found.set_coords([name for name in coordinates if name in found])
 
 
 def gain_errors(path: Path) -> xarray.Dataset:
@@ -265,19 +264,14 @@ NO_RUN = "is not the folder of a finished run; give one that 'calstudy run' prin
 def arrays_of_figure(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of a figure; raises InputError if the file is damaged or cannot be read."""
     try:
-        # numpy does not close a damaged file that it opens itself.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return dict(file)
+        return read_arrays(path)
     except DAMAGE as error:
         raise InputError(f"{path}: the arrays of the figure cannot be read ({error})") from None
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """The folder of a finished run, or of a reference, whose figures are beside its manifest.
-
-    Every property reads its file when it is first used, and raises InputError if the file is damaged.
-    """
+    """The folder of a finished run, or of a reference; its properties raise InputError if a file is damaged."""
 
     path: Path
 
@@ -348,7 +342,7 @@ class RunFolder:
         """The tables of the run; raises InputError if there are none."""
         if not (self.path / "tables").is_dir():
             collected = self.manifest.get("members") if (self.path / MANIFEST).is_file() else None
-            remedy = "give the folder of one of its members" if collected else "run the experiment again"
+            remedy = "give the folder of one of its members" if collected else AGAIN
             raise InputError(f"{self.path}: has no tables; {remedy}")
         return Tables((self.path / "tables",))
 
@@ -381,8 +375,6 @@ class RunFolder:
     def _scores(self) -> Mapping[str, Mapping[str, Any]]:
         """The scores of a comparison by world and calibrator; empty for other runs."""
         path = self.path / "tables" / COMPARISON
-        if not path.is_file():
-            return {}
 
         def read(file: Path) -> dict[str, Any]:
             scores = read_json(file)
@@ -390,7 +382,7 @@ class RunFolder:
             standings(scores)
             return scores
 
-        return _undamaged(path, read, "run the comparison again")
+        return _undamaged(path, read, "run the comparison again") if path.is_file() else {}
 
     @property
     def has_claims(self) -> bool:
@@ -402,7 +394,7 @@ class RunFolder:
         """Verdicts on the statements of papers; empty without claims.json."""
         return self.verdicts(self.path / CLAIMS_JSON, f"write it again: calstudy claims {self.path}")
 
-    def verdicts(self, path: Path, remedy: str = "run the experiment again") -> list[Verdict]:
+    def verdicts(self, path: Path, remedy: str = AGAIN) -> list[Verdict]:
         """Return the verdicts of a JSON file; empty if it does not exist."""
         if not path.is_file():
             return []
@@ -415,10 +407,7 @@ def find_runs(folder: Path) -> list[RunFolder]:
 
 
 def keys_of_runs(folder: Path) -> set[str]:
-    """Return the keys of the products of all runs in a folder and its subfolders.
-
-    Raises InputError without a folder, and for a folder, or the manifest of a run, that cannot be read.
-    """
+    """Return the keys of the products of all runs in a folder and below; raises InputError if any cannot be read."""
 
     def stop(error: OSError) -> NoReturn:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}), and may hold runs")
@@ -438,10 +427,7 @@ def keys_of_runs(folder: Path) -> set[str]:
 
 
 def _runs_in(folder: Path, on_error: Callable[[OSError], None] | None = None) -> list[RunFolder]:
-    """Return all runs in a folder and its subfolders, which may be links; a folder that is found twice counts once.
-
-    `on_error` is called with the error of a folder that cannot be read; by default it is left out.
-    """
+    """Return all runs in a folder and its subfolders, which may be links; see `os.walk` for `on_error`."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of runs")
     found, seen = [], set()

@@ -10,9 +10,10 @@ import re
 import shutil
 import socket
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from graphlib import TopologicalSorter
 from importlib import import_module
 from numbers import Integral
 from pathlib import Path
@@ -119,10 +120,7 @@ def _disk_error(order: WorkOrder, reason: str) -> DiskError:
 
 
 def _require_room(order: WorkOrder) -> None:
-    """Raise DiskError if a product has no room on the disk.
-
-    HDF5 crashes where the disk is full when it closes a file of which it could not write the head.
-    """
+    """Raise DiskError if a product has no room on the disk, where HDF5 would crash when it closes a file."""
     disk = shutil.disk_usage(order.store)
     # Some file systems of networks do not say their size.
     if disk.total > 0 and disk.free < order.disk + SPARE:
@@ -140,7 +138,7 @@ def _other(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
 
 
 def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
-    """Return the reason why a file of the store could not be written, or None for any other error."""
+    """Return why a file of the store could not be written, or None for any other error."""
     if not root.is_dir():
         return "it was removed while it was written"
     name = getattr(error, "filename", None)
@@ -150,14 +148,15 @@ def _unwritable(error: OSError | RuntimeError, root: Path) -> str | None:
 
 
 def _verified_inputs(order: WorkOrder, store: Store) -> dict[str, Product]:
-    products = {name: store.verify(*address) for name, address in order.inputs.items()}
-    damaged = [f"{order.inputs[name][0]}/{order.inputs[name][1]}" for name, found in products.items() if found is None]
-    if damaged:
-        raise InputError(
-            f"{order.name}: its input {damaged[0]} was removed or damaged while the run was "
-            "going on; run again to rebuild it"
-        )
-    return {name: product for name, product in products.items() if product is not None}
+    products = {}
+    for name, (stage, key) in order.inputs.items():
+        if (product := store.verify(stage, key)) is None:
+            raise InputError(
+                f"{order.name}: its input {stage}/{key} was removed or damaged while the run was going on; run again "
+                "to rebuild it"
+            )
+        products[name] = product
+    return products
 
 
 def _is_of_other_code(product: Product, order: WorkOrder, store: Store) -> bool:
@@ -218,11 +217,7 @@ BEGUN, WAITS = "begun", "waits"
 
 @dataclass(frozen=True)
 class Schedule:
-    """Tasks that a run must make, every one after its inputs.
-
-    Among them are those with damaged products, and those of intact products of other code, by key, that are made
-    `again`.
-    """
+    """Tasks to make, every one after its inputs, with those of damaged products and the keys of what is made again."""
 
     todo: tuple[Task, ...]
     damaged: tuple[Task, ...]
@@ -234,8 +229,8 @@ class Budget:
     """Resources of a run.
 
     Without a number of workers there is one for each core within the memory; `max_memory` of all workers together is
-    such as "6 GB", by default all that is free. The memory of a running dask scheduler, given by its address, is not
-    checked. A `strict` run also makes products of other code or other versions of packages again.
+    such as "6 GB", by default all that is free. That of a running dask scheduler is not checked. A `strict` run also
+    makes products of other code or other versions of packages again.
     """
 
     workers: int | None = None
@@ -267,11 +262,10 @@ class Budget:
 
 @dataclass(frozen=True)
 class Workers:
-    """The processes that make the products.
+    """The processes that make the products: `count` of this machine, or those of a running dask scheduler.
 
-    `count` worker processes are started on this machine; with one, the work is done in this process. They append their
-    standard error to the file `log`. `scheduler` is the address of a running dask scheduler whose workers are used
-    instead, or the file in which it has its address, or None.
+    With one, the work is done in this process. They append their standard error to the file `log`. `scheduler` is an
+    address, or the file that has it.
     """
 
     count: int
@@ -286,10 +280,7 @@ def found_of(tasks: Iterable[Task], store: Store) -> dict[str, Product]:
 
 
 def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
-    """Return the targets, and what they are made from and is kept, of which there are folders without intact records.
-
-    A run shows the warnings of all of these products, and would lose theirs.
-    """
+    """Return the targets, and kept inputs, whose folders have no intact record: a run would lose their warnings."""
     kept = [task for task in unique(targets) if not task.temporary]
     found = found_of(kept, store)
     return [task for task in kept if task.key not in found and store.exists(task.stage.name, task.key)]
@@ -298,11 +289,10 @@ def without_record(targets: Sequence[Task], store: Store) -> list[Task]:
 def schedule(
     targets: Sequence[Task], store: Store, given: Container[str] = (), strict: bool = False, quick: bool = False
 ) -> Schedule:
-    """Find the tasks to make: the targets and all that they need, unless the store has them intact.
+    """Find the tasks to make: the targets and all that they need, but those intact in the store, or with `given` keys.
 
-    A kept product without an intact record is made again even if nothing else has to be made from it. Products with
-    keys in `given` are not made. With `strict`, products of other code or other versions of packages are made again.
-    A `quick` look reads no files of products, and misses damaged ones behind what is intact.
+    Those of `without_record` are made again, and with `strict` products of other code or other versions of packages. A
+    `quick` look reads no files of products, and misses damaged ones behind what is intact.
     """
     other: Container[str] = ()
     if strict:
@@ -401,22 +391,17 @@ def _cluster(workers: int) -> LocalCluster:
         os.environ.pop("PYTHONSAFEPATH", None)
 
 
-@contextmanager
-def _client(workers: Workers) -> Iterator[Client]:
+def _client(workers: Workers) -> AbstractContextManager[Client]:
     if workers.scheduler is None:
-        with _local_client(workers.count, workers.log) as client:
-            yield client
-        return
+        return _local_client(workers.count, workers.log)
     from distributed import Client
 
     path = Path(workers.scheduler)
     address = {"scheduler_file": str(path)} if path.is_file() else {"address": workers.scheduler}
     try:
-        client = Client(**address)
+        return Client(**address)
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"--scheduler {workers.scheduler}: cannot connect ({error})") from None
-    with client:
-        yield client
 
 
 def _announce_and_perform(order: WorkOrder) -> Product:
@@ -434,49 +419,6 @@ def _last_begun(client: Client, worker: str) -> str | None:
     return begun[-1] if begun else None
 
 
-class _Queue:
-    """Submits tasks to the workers, each once all its inputs are made.
-
-    The scheduler does not know the dependencies. If a worker dies, its current product is made again, but not its
-    earlier ones: products are files, and temporary ones may have been removed.
-    """
-
-    def __init__(self, tasks: Sequence[Task], store: Store, client: Client, again: Container[str]) -> None:
-        self._store, self._client, self._again = store, client, again
-        self._priority = {task.key: -place for place, task in enumerate(tasks)}
-        self._tasks = {task.key: task for task in tasks}
-        self._missing = {
-            task.key: {needed.key for needed in task.needs.values()} & self._tasks.keys() for task in tasks
-        }
-        self._users: dict[str, list[str]] = {task.key: [] for task in tasks}
-        for key, missing in self._missing.items():
-            for needed in missing:
-                self._users[needed].append(key)
-
-    def first(self) -> dict[Future, Task]:
-        """Submit the tasks without missing inputs."""
-        return self._submit(key for key, missing in self._missing.items() if not missing)
-
-    def after(self, task: Task) -> dict[Future, Task]:
-        """Submit the tasks for which this one was the last missing input."""
-        users = self._users[task.key]
-        for key in users:
-            self._missing[key].discard(task.key)
-        return self._submit(key for key in users if not self._missing[key])
-
-    def _submit(self, keys: Iterable[str]) -> dict[Future, Task]:
-        return {self._future(self._tasks[key]): self._tasks[key] for key in keys}
-
-    def _future(self, task: Task) -> Future:
-        return self._client.submit(
-            _announce_and_perform,
-            WorkOrder.of(task, self._store, task.key in self._again),
-            key=f"{task.stage.name}-{task.key}-{digest_json(str(self._store.root))[:8]}",
-            priority=self._priority[task.key],
-            pure=False,
-        )
-
-
 def execute(
     tasks: Sequence[Task],
     store: Store,
@@ -487,58 +429,80 @@ def execute(
 ) -> dict[str, Product]:
     """Make the products of `tasks`, and return them by key.
 
-    Tasks are from `schedule`, ordered so that each follows its inputs. The store is on a file system that all workers
-    share. `done` is called after each product, and `warn` with a sentence for each wait for the lock of another run.
-    Products with keys in `again` are made even if they exist.
-
-    Raises InputError if the scheduler cannot be reached or is lost, a worker dies repeatedly, or a stage refuses its
-    input.
+    Tasks are from `schedule`, ordered so that each follows its inputs. `done` is called after each product, and `warn`
+    with a sentence for each wait for the lock of another run. Products with keys in `again` are made even if they
+    exist. Raises InputError as `perform`, and if the scheduler cannot be reached or is lost, or a worker dies
+    repeatedly.
     """
     products: dict[str, Product] = {}
     if not tasks:
         return products
-    from distributed import CancelledError, KilledWorker, as_completed
+    from distributed import as_completed
+
+    by_key, places = {task.key: task for task in tasks}, {task.key: place for place, task in enumerate(tasks)}
+    # The scheduler does not know the dependencies. If a worker dies, its current product is made again, but not its
+    # earlier ones: products are files, and temporary ones may have been removed.
+    inputs = {task.key: [need.key for need in task.needs.values()] for task in tasks}
+    order = TopologicalSorter({key: [need for need in needs if need in places] for key, needs in inputs.items()})
+    order.prepare()
+
+    def ready(client: Client) -> dict[Future, Task]:
+        """Submit the tasks whose inputs are all made, each once."""
+        return {
+            client.submit(
+                _announce_and_perform,
+                WorkOrder.of(by_key[key], store, key in again),
+                key=f"{by_key[key].stage.name}-{key}-{digest_json(str(store.root))[:8]}",
+                priority=-places[key],
+                pure=False,
+            ): by_key[key]
+            for key in order.get_ready()
+        }
 
     with _client(workers) as client:
         client.subscribe_topic(WAITS, lambda event: warn(event[1]))
-        queue = _Queue(tasks, store, client, again)
-        futures = queue.first()
+        futures = ready(client)
         completed = as_completed(futures)
         for future in completed:
             task = futures.pop(future)
-            try:
-                product = future.result()
-            except KilledWorker as error:
-                # All tasks that were assigned to the worker fail, not only the one that it was making.
-                begun = _last_begun(client, error.last_worker.address) or f"{task.stage.name} ({task.label})"
-                raise InputError(
-                    f"{begun}: its worker process died repeatedly, for want of memory or by a crash of code that it "
-                    "runs; use fewer --workers, or smaller chunks, and run again: finished products are kept"
-                ) from None
-            except CancelledError:
-                where = "" if workers.scheduler is None else f"--scheduler {workers.scheduler}: "
-                raise InputError(
-                    f"{where}the dask scheduler was lost before {task.stage.name} ({task.label}) was made; run again: "
-                    "finished products are kept"
-                ) from None
+            products[task.key] = product = _result(future, task, client, workers)
             # Otherwise the client would compute this result again if its worker dies.
             future.release()
-            products[task.key] = product
-            started = queue.after(task)
+            order.done(task.key)
+            started = ready(client)
             futures |= started
             completed.update(started)
             done(task, product)
     return products
 
 
-class Lifetimes:
-    """Lifetimes of the temporary products of a run: until the last task that needs them is made.
+def _result(future: Future, task: Task, client: Client, workers: Workers) -> Product:
+    """Return a product that a worker has made; raises InputError if a process was lost."""
+    from distributed import CancelledError, KilledWorker
 
-    A product is temporary if all tasks of the targets that make it are; `todo` are the tasks from `schedule`.
-    """
+    try:
+        return future.result()
+    except KilledWorker as error:
+        # All tasks that were assigned to the worker fail, not only the one that it was making.
+        begun = _last_begun(client, error.last_worker.address) or f"{task.stage.name} ({task.label})"
+        raise InputError(
+            f"{begun}: its worker process died repeatedly, for want of memory or by a crash of code that it "
+            "runs; use fewer --workers, or smaller chunks, and run again: finished products are kept"
+        ) from None
+    except CancelledError:
+        where = "" if workers.scheduler is None else f"--scheduler {workers.scheduler}: "
+        raise InputError(
+            f"{where}the dask scheduler was lost before {task.stage.name} ({task.label}) was made; run again: "
+            "finished products are kept"
+        ) from None
+
+
+class Lifetimes:
+    """Lifetimes of the products of a run that all of its tasks call temporary: until the last task that needs them."""
 
     def __init__(self, targets: Iterable[Task], todo: Sequence[Task]) -> None:
-        tasks = _all_tasks(targets)
+        # Also different tasks that make the same product.
+        tasks = unique(targets, by=id)
         self._kept = {task.key: task for task in tasks if not task.temporary}
         self._temporary = {task.key: task for task in tasks if task.key not in self._kept}
         self._users = dict.fromkeys(self._temporary, 0)
@@ -565,18 +529,6 @@ class Lifetimes:
         for key in needed:
             self._users[key] -= 1
         return [self._temporary[key] for key in needed if self._users[key] == 0]
-
-
-def _all_tasks(targets: Iterable[Task]) -> list[Task]:
-    """Return targets and all that they need, including different tasks that make the same product."""
-    found: dict[int, Task] = {}
-    waiting = list(targets)
-    while waiting:
-        task = waiting.pop()
-        if id(task) not in found:
-            found[id(task)] = task
-            waiting += task.needs.values()
-    return list(found.values())
 
 
 def largest_disk(targets: Iterable[Task], todo: Sequence[Task]) -> float:

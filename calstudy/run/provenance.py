@@ -97,8 +97,7 @@ def lineages(tasks: Iterable[Task]) -> dict[str, str]:
     """Return by key the lineages that products would have if they were made now; every task follows its inputs."""
     found: dict[str, str] = {}
     for task in tasks:
-        needs = [found[needed.key] for needed in task.needs.values()]
-        found[task.key] = lineage(made_with(task), needs)
+        found[task.key] = lineage(made_with(task), (found[needed.key] for needed in task.needs.values()))
     return found
 
 
@@ -171,9 +170,6 @@ def machine() -> dict[str, Any]:
 
 def seeds(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return every seed in nested settings but those of scales, by its dotted path."""
-    found = {
-        path: value
-        for path, value in leaves(settings)
-        if path.rpartition(".")[2] in ("seed", "seeds", "seeds_without_eor")
-    }
+    names = ("seed", "seeds", "seeds_without_eor")
+    found = {path: value for path, value in leaves(settings) if path.rpartition(".")[2] in names}
     return {path: value for path, value in found.items() if not path.startswith("scales.")}

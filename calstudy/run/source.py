@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -184,10 +184,6 @@ def _module(name: str) -> _Module | None:
     return module
 
 
-def _calls(node: ast.AST | None, called: type) -> TypeGuard[ast.Call]:
-    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == called.__name__
-
-
 def _for_types(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
 
@@ -246,7 +242,7 @@ def _definition(address: Address) -> _Definition:
         for statement in statements
         if PackageFile.__name__ in {*module.imports, *module.statements}
         for node in ast.walk(statement)
-        if _calls(node, PackageFile)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == PackageFile.__name__
     }
     digest = sha256(_normal(statements).encode()).hexdigest() if statements else ""
     return _Definition(digest, frozenset(packages), frozenset(files), frozenset(needs))

@@ -61,10 +61,10 @@ class Product:
 
 
 def _holder(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8") or "a process that does not say"
-    except OSError:
-        return "a process that does not say"
+    with suppress(OSError):
+        if text := path.read_text(encoding="utf-8"):
+            return text
+    return "a process that does not say"
 
 
 def _inside(name: str) -> bool:
@@ -74,10 +74,9 @@ def _inside(name: str) -> bool:
 
 
 def require_writable(folder: Path, name: str) -> None:
-    """Raise InputError if a folder, which need not exist, cannot be created or written.
+    """Raise InputError, with the `name` of a field or option, if a folder cannot be created or written.
 
-    Permissions alone are not sufficient: nobody, not even root, can create a folder in /proc. A temporary folder is
-    therefore created in the existing part of the path. `name` is the field or option, with its value, for the message.
+    Permissions do not tell it (nobody can create a folder in /proc): a temporary folder is made in what exists of it.
     """
     found = folder
     try:
@@ -103,10 +102,7 @@ class Store:
             self.root.mkdir(parents=True, exist_ok=True)
 
     def folder(self, stage: str, key: str) -> Path:
-        """Return the folder of the product with this stage and key, which need not exist.
-
-        Raises ValueError if either is not a plain name, because the folder could then be elsewhere.
-        """
+        """Return the folder of a product, which need not exist; raises ValueError if it could be outside the store."""
         if not (PLAIN.fullmatch(stage) and PLAIN.fullmatch(key)):
             raise ValueError(f"stage {stage!r} and key {key!r} of a product must be plain names")
         return self.root / stage / key
@@ -122,43 +118,35 @@ class Store:
             return None
         if recorded != digest_json(record) or not all(_inside(name) for name in sizes):
             return None
-        if record.get("key") != key or any(sizes[name] != entry["bytes"] for name, entry in record["files"].items()):
-            return None
-        return Product(folder, record)
+        intact = all(sizes[name] == entry["bytes"] for name, entry in record["files"].items())
+        return Product(folder, record) if intact and record.get("key") == key else None
 
     def verify(self, stage: str, key: str) -> Product | None:
         """Return the product if every file still has its recorded SHA-256, else None."""
         product = self.find(stage, key)
-        if product is None:
-            return None
-        try:
-            intact = all(
-                sha256(product.path / name) == entry["sha256"] for name, entry in product.record["files"].items()
-            )
-        except OSError:
-            return None
-        return product if intact else None
+        files = {} if product is None else product.record["files"]
+        with suppress(OSError):
+            if all(sha256(self.folder(stage, key) / name) == entry["sha256"] for name, entry in files.items()):
+                return product
+        return None
 
     def exists(self, stage: str, key: str) -> bool:
         """Return whether there is any folder under this key, intact or damaged."""
-        try:
-            return self.folder(stage, key).exists()
-        except OSError:
-            return False  # A name that no file can have, or a folder that may not be read.
+        # It may have a name that no file can have, or be in a folder that may not be read.
+        return os.path.exists(self.folder(stage, key))  # noqa: PTH110
 
     def addresses(self) -> list[tuple[str, str]]:
         """Return stage and key of every product in the store, intact or damaged.
 
-        Other folders are not listed, because what is damaged may be deleted: a product has the name of a key, and a
-        record or the file of its lock.
+        Any other folder, which lacks the name of a key, or a record and the file of a lock, must not be deleted.
         """
-        found = (path for path in sorted(self.root.glob("[!.]*/[!.]*")) if path.is_dir())
-        named = [(path.parent.name, path.name) for path in found if KEY.fullmatch(path.name)]
         return [
-            (stage, key)
-            for stage, key in named
-            if PLAIN.fullmatch(stage)
-            and ((self.root / stage / key / RECORD).exists() or self._lock_file(stage, key).exists())
+            (path.parent.name, path.name)
+            for path in sorted(self.root.glob("[!.]*/[!.]*"))
+            if path.is_dir()
+            and KEY.fullmatch(path.name)
+            and PLAIN.fullmatch(path.parent.name)
+            and ((path / RECORD).exists() or self._lock_file(path.parent.name, path.name).exists())
         ]
 
     def discard(self, stage: str, key: str) -> None:
@@ -218,10 +206,7 @@ class Store:
 
     @contextmanager
     def building(self, stage: str, key: str) -> Iterator[Path]:
-        """Yield an empty folder to fill, under `lock`; call `seal` on it before leaving.
-
-        Folders that a killed run has left are removed.
-        """
+        """Yield an empty folder to fill, under `lock`, and then to `seal`; those that a killed run left are removed."""
         parent = self.root / stage
         parent.mkdir(exist_ok=True)
         for leftover in (*parent.glob(f".building-{key}-*"), *parent.glob(f".discarded-{key}-*")):
@@ -234,10 +219,7 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
 
     def seal(self, folder: Path, record: Mapping[str, Any]) -> Product:
-        """Record the files of a filled folder from `building`, and give it its final name.
-
-        The record is JSON-able, and contains `stage` and `key`.
-        """
+        """Record the files of a folder from `building`, and give it the name of the `stage` and `key` in the record."""
         files = {
             path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": sha256(path)}
             for path in sorted(folder.rglob("*"))
@@ -273,10 +255,7 @@ def products(store: Store) -> Iterator[Product]:
 
 @dataclass(frozen=True)
 class Leftover:
-    """A folder that a killed run was filling or removing, or that a run is filling now.
-
-    `size` is that of its files in bytes, `age` the time since its last change in seconds, `key` that of its product.
-    """
+    """A folder that a run fills, or a killed one left: key of its product, bytes, seconds since its last change."""
 
     path: Path
     key: str
@@ -311,12 +290,9 @@ def unreferenced(found: Iterable[Product], named: Iterable[str]) -> list[Product
         key = waiting.pop()
         if key not in used:
             used.add(key)
-            waiting += _inputs(known[key].record) if key in known else []
+            inputs = known[key].record.get("inputs", {}) if key in known else {}
+            waiting += [needed for _, needed in inputs.values()]
     return [product for key, product in known.items() if key not in used]
-
-
-def _inputs(record: Any) -> list[str]:
-    return [str(key) for _, key in record.get("inputs", {}).values()]
 
 
 LEASES = ".runs"
@@ -348,15 +324,9 @@ class Lease:
             lock.release()
 
     def drop(self, tasks: Iterable[Task]) -> None:
-        """Give up tasks, and remove those of their products that were made as temporary ones and that nobody needs.
-
-        Products that a run made to be kept stay, and so does everything in a read-only store.
-        """
-        given_up = list(tasks)
-        found = {task.key: self._store.find(task.stage.name, task.key) for task in given_up}
-        temporary = {
-            key: product for key, product in found.items() if product is not None and product.record.get("temporary")
-        }
+        """Give up tasks, and remove their temporary products that nobody needs; a read-only store stays as it is."""
+        found = {task.key: self._store.find(task.stage.name, task.key) for task in tasks}
+        temporary = {key: product for key, product in found.items() if product and product.record.get("temporary")}
         if not temporary and self._keys.isdisjoint(found):
             return
         with suppress(OSError), self._store.lock(*LEASE_LOCK):
@@ -387,9 +357,9 @@ def needed_by_runs(store: Store, but: Path | None = None) -> set[str]:
             # The run may end at this moment.
             with suppress(FileNotFoundError):
                 found.update(json.loads(path.read_text(encoding="utf-8")))
-            continue
-        _remove(path)
-        lock.release()
+        else:
+            _remove(path)
+            lock.release()
     return found
 
 

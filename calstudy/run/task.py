@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import cache, cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias, dataclass_transform
 
@@ -61,9 +62,9 @@ class Declared:
 class Task(Declared, ABC):
     """One product to be made. A kind of product is a subclass, with the name and the version of its stage.
 
-    Its fields are the products that it needs (`Input`, `Inputs`, `Piece`) and all settings that it reads: validated
-    sections of the experiment, and plain JSON-able values. A setting with its default is not part of the key. The label
-    describes the product in a few words; a temporary one may be removed once the products that need it are made.
+    Its fields are the products that it needs (`Input`, `Inputs`, `Piece`) and all settings that it reads, sections and
+    plain JSON-able values, which are in the key unless they have their default. The label describes the product in a
+    few words; a temporary one may be removed once the products that need it are made.
     """
 
     stage: ClassVar[Stage]
@@ -80,10 +81,7 @@ class Task(Declared, ABC):
 
     @abstractmethod
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the files of the product to an empty folder, and return JSON-able notes about it.
-
-        Slow libraries are imported inside, because plans are made without them.
-        """
+        """Write the files of the product to an empty folder, and return JSON-able notes; slow libraries are inside."""
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return the tables by which a report shows the product that is in a folder."""
@@ -171,15 +169,17 @@ def _each(name: str, kind: str, value: Any, change: Callable[[str, Any], Any]) -
     return change(name, value)
 
 
-def unique(tasks: Iterable[Task], given: Container[str] = ()) -> list[Task]:
+def unique(
+    tasks: Iterable[Task], given: Container[str] = (), by: Callable[[Task], Any] = attrgetter("key")
+) -> list[Task]:
     """Return tasks and all that they need, once each, every task after its inputs; those in `given` need nothing."""
-    found: dict[str, Task] = {}
+    found: dict[Any, Task] = {}
 
     def visit(task: Task) -> None:
-        if task.key not in found:
+        if by(task) not in found:
             for needed in () if task.key in given else task.needs.values():
                 visit(needed)
-            found[task.key] = task
+            found[by(task)] = task
 
     for task in tasks:
         visit(task)
