@@ -217,18 +217,12 @@ GLEAM_URL = (
 GLEAM_SOURCES = 307_455
 
 
-def gleam_path() -> Path:
-    """Return the default path of the catalogue that `fetch_gleam` downloads."""
-    return default_directory() / GLEAM_FILE
-
-
 def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     """Download the GLEAM extragalactic catalogue from VizieR, or verify an existing copy, and return its path.
 
     VizieR generates the table for every request and publishes no hash of it. The first download is accepted if it has
-    the required columns and the published number of sources, 307,455. Its SHA-256 is then saved next to it, and
-    checked at every later use. The directory is by default `default_directory`, and is created if necessary. Raises
-    InputError if the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
+    the required columns and the published number of sources. Its SHA-256 is then saved next to it, and checked at every
+    later use. Raises InputError if the download fails or is not the catalogue, or if the copy has changed.
     """
     directory = default_directory() if directory is None else directory
     path = directory / GLEAM_FILE

@@ -25,7 +25,6 @@ from calstudy.sky import settings as section
 from calstudy.sky.catalogue import (
     GLEAM_SOURCES,
     brightest,
-    gleam_path,
     make_catalogue,
     make_points,
     make_power_law,
@@ -208,12 +207,7 @@ def _make(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds
 
 
 def _gleam(settings: section.GleamSources) -> Foregrounds:
-    path = gleam_path() if settings.path is None else settings.path
-    if not path.is_file():
-        raise InputError(
-            f"sky.foregrounds: the GLEAM catalogue is not at {path}: download it with `calstudy data fetch gleam`, "
-            "set its path, or use kind: g4jy-and-counts"
-        )
+    path = section.find_gleam() if settings.path is None else settings.path
     verify_gleam(path)
     catalogue = read_gleam_table(path)
     stand_in = None
