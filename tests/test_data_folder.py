@@ -62,7 +62,7 @@ def test_tiles_are_the_antennas_of_the_layouts():
 
 def test_the_excerpt_holds_the_brightest_sources_of_the_catalogue():
     catalogue = read_gleam_table(G4JY.find())
-    brightest = catalogue.select(np.argsort(-catalogue.flux, kind="stable")[:20])
+    brightest = catalogue[np.argsort(-catalogue.flux, kind="stable")[:20]]
     rows = rows_of("catalogue_excerpt.csv")
     assert [row["name"] for row in rows] == brightest.names.tolist()
     for column, expected, digits in (

@@ -95,10 +95,8 @@ def set_levels(
     """Scale the EoR to `eor_level` below the foregrounds and the noise to its reference.
 
     The paper's decibels are of brightness: -40 dB is a ratio of rms visibilities of 1e-4, so that the residuals' -45 dB
-    are -90 dB in the power spectrum. So rms of scaled EoR / rms of foregrounds = 10^(level / 10).
-
-    The rms of the simulated visibilities and the standard deviation of radiometer noise, (Nfreqs, Npols)
-    (`radiometer_std`), are in Jy. Raise InputError if a component is zero that must be scaled, or scaled to.
+    are -90 dB in the power spectrum. The rms of the simulated visibilities and the standard deviation of radiometer
+    noise, (Nfreqs, Npols), are in Jy. Raise InputError if a component is zero that must be scaled, or scaled to.
     """
     factor = eor_factor(foreground_rms, eor_rms, settings.eor_level)
     noise, spectrum = settings.noise, None

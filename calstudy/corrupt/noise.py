@@ -125,8 +125,7 @@ Noise = Annotated[
 def thermal_noise(shape: tuple[int, ...], std: float | np.ndarray, seed: int) -> np.ndarray:
     """Draw circular complex Gaussian noise with E|n|^2 = std^2, independent in every sample, complex128.
 
-    `std` is a number or an array that broadcasts with the shape; the real and the imaginary part have std / sqrt(2)
-    each. The same seed and shape give the same noise.
+    `std` is a number or an array that broadcasts with the shape. The same seed and shape give the same noise.
     """
     rng = np.random.default_rng(seed)
     noise = np.empty(shape, dtype=np.complex128)

@@ -67,7 +67,7 @@ def not_tabulated(experiment: Experiment) -> str | None:
 def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> BeamInterpolation:
     """Compare a beam's fit with its table, and other interpolations with the fit at one of `step` channels."""
     beams = {name: interpolated(instrument.beam, instrument.channels, name) for name in INTERPOLATIONS}
-    tabulated = beams[SMOOTH].tabulated_frequencies
+    tabulated = beams[SMOOTH].table.tabulated_frequencies
     difference = _difference(beams[SMOOTH], beams["nearest"], tabulated)
     settings = instrument.channels
     channels = (settings.first + settings.width * np.arange(settings.count))[::step]

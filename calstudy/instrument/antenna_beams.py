@@ -6,7 +6,9 @@ Beams may differ by design, or because antennas are tilted, rotated, wider or na
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import numpy as np
 from pyuvdata import UVBeam, UVData
@@ -17,11 +19,18 @@ from scipy.spatial.transform import Rotation
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import guarded
 from calstudy.instrument.as_built import Misalignment
-from calstudy.instrument.beam_grid import bspline_coefficients, cells, fixed_components, polar_components, spline_fields
+from calstudy.instrument.beam_grid import (
+    bspline_coefficients,
+    cells,
+    describe,
+    fixed_components,
+    polar_components,
+    spline_fields,
+    tabulate,
+)
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams, Beam, model_of
 from calstudy.instrument.settings import AssignedBeam, InstrumentSettings, assigned_beams, nominal_beams
-from calstudy.instrument.tabulated import describe, tabulate
 
 
 def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | AntennaBeams:
@@ -41,20 +50,21 @@ def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | A
 def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[AntennaBeam]:
     models = nominal_beams(settings)
     made: dict[tuple, Beam] = {}
-    for model in dict.fromkeys(beam.model for beam in distinct):
-        section, members = models[model], [beam for beam in distinct if beam.model == model]
-        if any(beam.amplitudes is None for beam in members):
+    for model, amplitudes in dict.fromkeys((beam.model, beam.amplitudes) for beam in distinct):
+        section = models[model]
+        if amplitudes is None:
             made[model, None] = make_beam(section, settings.channels)
-        tiles = list(dict.fromkeys(beam.amplitudes for beam in members if beam.amplitudes is not None))
-        if tiles:
+        else:
             with guarded(section):
-                tile_beams = model_of(section).make_tiles(settings.channels, np.array(tiles))
-            made |= {(model, amplitudes): beam for amplitudes, beam in zip(tiles, tile_beams, strict=True)}
+                (made[model, amplitudes],) = model_of(section).make_tiles(settings.channels, np.array([amplitudes]))
     nominal = Misalignment()
     found = [((beam.model, beam.amplitudes), beam.misalignment) for beam in distinct]
     counts = Counter(key for key, error in found if error != nominal)
-    shared = {key: NominalBeam(made[key], keep=count > 1) for key, count in counts.items()}
-    return [made[key] if error == nominal else MisalignedBeam(shared[key], error) for key, error in found]
+    # The splines of the frequencies that were requested last are worth their memory if several antennas have the beam.
+    shared = {key: lru_cache(maxsize=1)(partial(_splined, made[key])) for key, count in counts.items() if count > 1}
+    return [
+        made[key] if error == nominal else MisalignedBeam(made[key], error, shared.get(key)) for key, error in found
+    ]
 
 
 def split_beams(beam: AntennaBeam | AntennaBeams, template: UVData) -> tuple[tuple[AntennaBeam, ...], np.ndarray]:
@@ -68,52 +78,37 @@ def split_beams(beam: AntennaBeam | AntennaBeams, template: UVData) -> tuple[tup
 MARGIN = 12
 
 
-class NominalBeam:
-    """The nominal beam of antennas that are misaligned, each in its own way.
+Splined = tuple[UVBeam | AnalyticBeam, np.ndarray]
 
-    It keeps the splines of the table at the frequencies that were requested last, if `keep` is true: that is worth the
-    memory if several antennas have the beam.
-    """
 
-    def __init__(self, beam: AntennaBeam, keep: bool = True) -> None:
-        self.name, self.stand_in = beam.name, beam.stand_in
-        self._beam, self._keep = beam, keep
-        self._kept: tuple[np.ndarray, UVBeam, np.ndarray] | None = None
-
-    def splined(self, frequencies: np.ndarray) -> tuple[UVBeam | AnalyticBeam, np.ndarray]:
-        """Return the E-field beam, and the coefficients of `_spline_table`, which are empty for a beam in closed form.
-
-        Raises InputError if a table does not cover all azimuths.
-        """
-        if self._kept is not None and np.array_equal(self._kept[0], frequencies):
-            return self._kept[1:]
-        beam = self._beam.at(frequencies)
-        if not isinstance(beam, UVBeam):
-            return beam, np.empty(0)
-        splines = _splines_of(beam)
-        if self._keep:
-            self._kept = np.array(frequencies), beam, splines
-        return beam, splines
+def _splined(beam: AntennaBeam, frequencies: tuple[float, ...]) -> Splined:
+    """Return an E-field beam, and the coefficients of `_spline_table`, which are empty for a beam in closed form."""
+    found = beam.at(np.array(frequencies))
+    return found, _splines_of(found) if isinstance(found, UVBeam) else np.empty(0)
 
 
 class MisalignedBeam:
     """The beam of an antenna whose orientation, width or feeds are not as designed (`AntennaBeam`).
 
     Its pattern moves with the antenna, and so does its polarization. It is one on the antenna's own axis, as the
-    nominal beam is at the zenith. If several antennas have the nominal beam, it should be a `NominalBeam`.
+    nominal beam is at the zenith. `splined` gives the nominal beam at frequencies, and its splines.
     """
 
-    def __init__(self, beam: AntennaBeam | NominalBeam, misalignment: Misalignment) -> None:
+    def __init__(
+        self,
+        beam: AntennaBeam,
+        misalignment: Misalignment,
+        splined: Callable[[tuple[float, ...]], Splined] | None = None,
+    ) -> None:
         self.name, self.stand_in = beam.name, beam.stand_in
-        self._beam = beam if isinstance(beam, NominalBeam) else NominalBeam(beam, keep=False)
-        self._misalignment = misalignment
+        self._splined, self._misalignment = splined or partial(_splined, beam), misalignment
 
     def at(self, frequencies: np.ndarray) -> UVBeam | AnalyticBeam:
         """Return the E-field beam at `frequencies` (Hz, (Nfreqs,)).
 
         Raises InputError if feeds are exchanged and there is only one, or a table does not cover all azimuths.
         """
-        beam, splines = self._beam.splined(frequencies)
+        beam, splines = self._splined(tuple(frequencies))
         if self._misalignment.swapped and list(beam.feed_array) != ["x", "y"]:
             raise InputError(f"instrument.as_built.beams.swapped: the beam {self.name} does not have feeds x and y")
         if isinstance(beam, UVBeam):

@@ -133,18 +133,18 @@ class AsBuilt(Section):
     def note(self) -> str | None:
         """A description of the differences from the nominal instrument, or None."""
         dipoles, beams = self.dipoles, self.beams
-        found = {
-            "positions": f"{100 * self.positions.scatter:g} cm" if self.positions.scatter else "",
-            "dead dipoles": f"{100 * dipoles.dead_fraction:g} %" if dipoles.dead_fraction else "",
-            "tiles with a dead dipole": f"{100 * dipoles.dead_tiles:g} %" if dipoles.dead_tiles else "",
-            "tiles with given dead dipoles": str(sum(len(group.antennas) for group in dipoles.dead.values()) or ""),
-            "dipole amplitudes": f"{100 * dipoles.amplitude_scatter:g} %" if dipoles.amplitude_scatter else "",
-            "pointing": f"{beams.pointing_scatter:g} deg" if beams.pointing_scatter else "",
-            "rotation": f"{beams.rotation_scatter:g} deg" if beams.rotation_scatter else "",
-            "beam widths": f"{100 * beams.width_scatter:g} %" if beams.width_scatter else "",
-            "swapped feeds": str(len(beams.swapped) or ""),
-        }
-        words = [f"{name} {value}" for name, value in found.items() if value]
+        found = (
+            ("positions", 100 * self.positions.scatter, " cm"),
+            ("dead dipoles", 100 * dipoles.dead_fraction, " %"),
+            ("tiles with a dead dipole", 100 * dipoles.dead_tiles, " %"),
+            ("tiles with given dead dipoles", sum(len(group.antennas) for group in dipoles.dead.values()), ""),
+            ("dipole amplitudes", 100 * dipoles.amplitude_scatter, " %"),
+            ("pointing", beams.pointing_scatter, " deg"),
+            ("rotation", beams.rotation_scatter, " deg"),
+            ("beam widths", 100 * beams.width_scatter, " %"),
+            ("swapped feeds", len(beams.swapped), ""),
+        )
+        words = [f"{name} {value:g}{unit}" for name, value, unit in found if value]
         return f"as built: {', '.join(words)}" if words else None
 
 

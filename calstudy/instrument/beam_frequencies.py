@@ -11,7 +11,6 @@ import numpy as np
 from calstudy.base.errors import InputError
 from calstudy.base.files import kept_while_unchanged
 from calstudy.base.foreign_files import require_self_contained
-from calstudy.base.package_files import BEAM
 
 # The tabulated MWA beam scatters from frequency to frequency by 2.4e-5 rms of the zenith value. A polynomial of order 8
 # over 36 MHz is the lowest that leaves no more than that; a higher one would follow the scatter. Narrower observations
@@ -54,12 +53,8 @@ def choose_frequencies(available: np.ndarray, band: tuple[float, float], interpo
     return chosen
 
 
-def mwa_frequencies(path: Path | None) -> np.ndarray:
-    """Return the frequencies (Hz, ascending) of an MWA beam file, by default that of `BEAM`.
-
-    Raises InputError if the file is missing, or has no frequencies of dipoles.
-    """
-    path = BEAM.find() if path is None else path
+def mwa_frequencies(path: Path) -> np.ndarray:
+    """Return the frequencies (Hz, ascending) of an MWA beam file; raises InputError if it is missing, or has none."""
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
     return _mwa_frequencies(path)

@@ -7,8 +7,10 @@ directions are interpolated between pixels (`fixed_components`), by bicubic spli
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import healpy
 import numba
@@ -29,6 +31,31 @@ UNRESOLVED = 2
 LEAST_DIRECTED, LEAST_ZENITH = 0.9, 1e-3
 # Rings below the horizon that splines may use (rad).
 BELOW = np.radians(15)
+NAMES = ("telescope_name", "feed_name", "feed_version", "model_name", "model_version", "history")
+DESCRIPTION = (*NAMES, "feed_array", "feed_angle", "axis1_array", "axis2_array", "basis_vector_array")
+"""Attributes of a UVBeam that do not depend on its frequencies."""
+
+
+def describe(beam: UVBeam) -> dict[str, Any]:
+    """Return the grid, feeds and names of a beam, for `tabulate`."""
+    return {name: getattr(beam, name) for name in DESCRIPTION}
+
+
+def tabulate(
+    description: Mapping[str, Any], jones: np.ndarray, frequencies: np.ndarray, normalization: str = "peak"
+) -> UVBeam:
+    """Return an E-field beam at frequencies in Hz, (Nfreqs,), with the grid, feeds and names of a description.
+
+    `jones` is (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex; "peak": one at the zenith.
+    """
+    return UVBeam.new(
+        **description,
+        data_normalization=normalization,
+        freq_array=np.asarray(frequencies, dtype=float),
+        mount_type="fixed",
+        pixel_coordinate_system="az_za",
+        data_array=np.ascontiguousarray(jones),
+    )
 
 
 def read_beamfits(path: Path) -> UVBeam:
@@ -115,24 +142,14 @@ def _on_grid(beam: UVBeam, feeds: list[str], path: Path) -> UVBeam:
     order = np.argsort(beam.freq_array)
     basis = np.zeros((2, 2, len(zenith_angle), len(azimuth)))
     basis[0, 0] = basis[1, 1] = 1.0
-    return UVBeam.new(
-        telescope_name=beam.telescope_name,
-        feed_name=beam.feed_name,
-        feed_version=beam.feed_version,
-        model_name=beam.model_name,
-        model_version=beam.model_version,
-        data_normalization="physical",
-        freq_array=beam.freq_array[order],
-        feed_array=feeds,
-        feed_angle=[np.pi / 2, 0.0][: len(feeds)],
-        mount_type="fixed",
-        pixel_coordinate_system="az_za",
-        axis1_array=azimuth,
-        axis2_array=zenith_angle,
-        basis_vector_array=basis,
-        data_array=jones[:, :, order],
-        history=beam.history,
-    )
+    description = {name: getattr(beam, name) for name in NAMES} | {
+        "feed_array": feeds,
+        "feed_angle": [np.pi / 2, 0.0][: len(feeds)],
+        "axis1_array": azimuth,
+        "axis2_array": zenith_angle,
+        "basis_vector_array": basis,
+    }
+    return tabulate(description, jones[:, :, order], beam.freq_array[order], "physical")
 
 
 def _smooth_values(beam: UVBeam, feeds: list[str]) -> np.ndarray:

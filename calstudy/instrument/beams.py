@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pyuvdata import UVBeam
@@ -25,9 +24,6 @@ from calstudy.instrument.beam_grid import polar_components
 from calstudy.instrument.interface import Beam, model_of
 from calstudy.instrument.settings import Channels
 from calstudy.instrument.tabulated import TabulatedBeam
-
-if TYPE_CHECKING:
-    from calstudy.instrument.dipoles import Tile
 
 FEEDS = {"xx": 0, "yy": 1}
 ZENITH_ANGLES = np.linspace(0, np.pi / 2, 361)
@@ -48,8 +44,7 @@ class MwaTile(AnalyticBeam):
     """An ideal 4 x 4 MWA tile pointed at zenith.
 
     Short dipoles, east-west and north-south, are 1.1 m apart and 0.278 m above an infinite conducting ground screen,
-    without mutual coupling. The beam is chromatic, and one at zenith. It is analytic, not a table: it is evaluated
-    exactly at every source and frequency.
+    without mutual coupling. The beam is chromatic, and one at zenith.
     """
 
     basis_vector_type = "az_za"
@@ -98,12 +93,10 @@ class ExactBeam:
     """
 
     def __init__(self, analytic: AnalyticBeam, name: str, stand_in: str | None) -> None:
-        self.name = name
-        self.stand_in: str | None = stand_in
-        self._analytic = analytic
+        self.name, self.stand_in, self._analytic = name, stand_in, analytic
         if isinstance(analytic, UnpolarizedAnalyticBeam):
             self._analytic = FeedBeam(formula=analytic, feed_array=analytic.feed_array, feed_angle=analytic.feed_angle)
-        self._angles: dict[tuple[int, bytes], np.ndarray] = {}
+        self._angles = lru_cache(maxsize=None)(self._solid_angles)
 
     def at(self, frequencies: np.ndarray) -> AnalyticBeam:
         """Return the analytic E-field beam, which is valid at any frequency (Hz)."""
@@ -111,14 +104,10 @@ class ExactBeam:
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p and Ω_pp in sr, (Nfreqs,) each; see `Beam`."""
-        wanted = np.asarray(frequencies, dtype=float)
-        key = FEEDS[polarization], wanted.tobytes()
-        if key not in self._angles:
-            self._angles[key] = self._solid_angles(wanted, key[0])
-        first, second = self._angles[key].copy()
+        first, second = self._angles(tuple(np.asarray(frequencies, dtype=float)), FEEDS[polarization]).copy()
         return first, second
 
-    def _solid_angles(self, frequencies: np.ndarray, feed: int) -> np.ndarray:
+    def _solid_angles(self, frequencies: tuple[float, ...], feed: int) -> np.ndarray:
         """Return Ω_p and Ω_pp, (2, Nfreqs), from a grid if it resolves the beam at all frequencies."""
         angles = []
         for frequency in frequencies:
@@ -126,7 +115,7 @@ class ExactBeam:
             found, coarse = (integrate_power(power[::n], ZENITH_ANGLES[::n]) for n in (1, 2))
             # Also false for a beam so narrow that both are zero.
             if not (np.abs(found - coarse) < RESOLVED * found).all():
-                return self._adaptive_solid_angles(frequencies, feed)
+                return self._adaptive_solid_angles(np.array(frequencies), feed)
             angles.append(found)
         return np.array(angles).T
 
@@ -152,34 +141,24 @@ class ExactBeam:
 
 
 class GriddedBeam:
-    """A beam tabulated on a grid of directions and frequencies (`Beam`).
+    """A beam tabulated on a grid of directions and frequencies (`Beam`)."""
 
-    `fit_error` is the largest difference of a Jones component from the tabulated one within the band, relative to the
-    zenith (`TabulatedBeam`). `tabulated_frequencies` are those of the table in and next to the band, in Hz, (Ntab,).
-    """
-
-    def __init__(self, table: TabulatedBeam | Tile, name: str, stand_in: str | None) -> None:
-        self.name = name
-        self.stand_in = stand_in
-        self.fit_error = table.fit_error
-        self.tabulated_frequencies = table.tabulated_frequencies
-        self._table = table
+    def __init__(self, table: TabulatedBeam, name: str, stand_in: str | None) -> None:
+        self.table, self.name, self.stand_in = table, name, stand_in
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
         """Return the E-field beam tabulated at `frequencies` (Hz); raises InputError for any outside its band."""
-        return self._table.at(frequencies)
+        return self.table.at(frequencies)
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p and Ω_pp in sr, (Nfreqs,) each; see `Beam`."""
-        first, second = _solid_angles(self._table, tuple(np.asarray(frequencies, dtype=float)), FEEDS[polarization])
+        first, second = _solid_angles(self.table, tuple(np.asarray(frequencies, dtype=float)), FEEDS[polarization])
         return first.copy(), second.copy()
 
 
 # The spectra of one run are made one after the other, and have the same beam.
 @lru_cache(maxsize=4)
-def _solid_angles(
-    table: TabulatedBeam | Tile, frequencies: tuple[float, ...], feed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _solid_angles(table: TabulatedBeam, frequencies: tuple[float, ...], feed: int) -> tuple[np.ndarray, np.ndarray]:
     angles = []
     for start in range(0, len(frequencies), CHANNELS_AT_A_TIME):
         jones = table.jones(np.array(frequencies[start : start + CHANNELS_AT_A_TIME]))[:, feed]
@@ -191,8 +170,7 @@ def _solid_angles(
 def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> np.ndarray:
     """Return ∫A dΩ and ∫A² dΩ above the horizon, in sr, (2, ...).
 
-    A is on a grid of zenith angles, (Nza,), in radians, increasing from 0, and equally spaced azimuths, (..., Nza,
-    Naz).
+    A, (..., Nza, Naz), is at zenith angles, (Nza,), rad, increasing from 0, and equally spaced azimuths.
     """
     horizon = min(np.pi / 2, zenith_angles[-1])
     rings = [2 * np.pi * np.sin(zenith_angles) * values.mean(axis=-1) for values in (power, power**2)]
@@ -202,9 +180,8 @@ def integrate_power(power: np.ndarray, zenith_angles: np.ndarray) -> np.ndarray:
 def make_beam(settings: Plugin, channels: Channels | None = None) -> Beam:
     """Return the beam of the `instrument.beam` section, by default for the channels of the paper.
 
-    Tabulated beams are read and fitted over a slightly wider band than the channels, and do not accept frequencies
-    outside it. Raises InputError if a beam file is missing, cannot be read, or does not cover the channels, or if a
-    plug-in makes something else.
+    Raises InputError if a beam file is missing, cannot be read, or does not cover the channels, or if a plug-in makes
+    something else.
     """
     channels = Channels() if channels is None else channels
     with guarded(settings):

@@ -11,14 +11,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from pyuvdata import UVBeam
 from pyuvdata.uvbeam.mwa_beam import MWABeam
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import BEAM
 from calstudy.instrument.as_built import FEEDS
 from calstudy.instrument.beam_frequencies import fit_range
-from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, mwa_embedded_element, tabulate
+from calstudy.instrument.tabulated import PIXELS_PER_DEGREE, TabulatedBeam, mwa_embedded_element
 
 
 class DipoleFields:
@@ -35,36 +34,22 @@ class DipoleFields:
             raise InputError(f"instrument.beam.path: {path} has feeds {', '.join(feeds)}, not x and y")
         fields = _single_fields(BEAM.find() if path is None else path, *fit_range(band))
         # Shape (Ndipoles, Nreduced, 2, Nfeeds, Nza, Naz).
-        self._reduced = np.stack([self.whole.interpolation.reduce(field) for field in fields])
-
-    def combined(self, amplitudes: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
-        """Return J of a tile, one at the zenith, (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex.
-
-        `amplitudes` are those of its dipoles, (2 [x, y], 16), and `frequencies` are in Hz, (Nfreqs,).
-        """
-        frequencies = self.whole.require_within(frequencies)
-        reduced = np.empty(self._reduced.shape[1:], dtype=complex)
-        for feed, weights in enumerate(amplitudes):
-            reduced[:, :, feed] = np.tensordot(weights, self._reduced[:, :, :, feed], axes=1)
-        return self.whole.normalized(reduced, frequencies)
+        self.reduced = np.stack([self.whole.interpolation.reduce(field) for field in fields])
 
 
-class Tile:
-    """The table of the beam of one tile with dipole amplitudes (2 [x, y], 16); used like a `TabulatedBeam`."""
+class Tile(TabulatedBeam):
+    """The table of the beam of one tile with dipole amplitudes (2 [x, y], 16)."""
 
     def __init__(self, fields: DipoleFields, amplitudes: np.ndarray) -> None:
-        whole = fields.whole
-        self._fields, self._amplitudes, self._description = fields, amplitudes, whole.description
-        self.zenith_angles, self.tabulated_frequencies = whole.zenith_angles, whole.tabulated_frequencies
-        self.fit_error = whole.fit_error
+        super().__init__(fields.whole.fitted)
+        self._fields, self._amplitudes = fields, amplitudes
 
-    def jones(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return J at `frequencies` in Hz; see `TabulatedBeam.jones`."""
-        return self._fields.combined(self._amplitudes, frequencies)
-
-    def at(self, frequencies: np.ndarray) -> UVBeam:
-        """Return the E-field beam tabulated at `frequencies` in Hz, (Nfreqs,)."""
-        return tabulate(self._description, self.jones(frequencies), frequencies)
+    @property
+    def reduced(self) -> np.ndarray:
+        """The weighted sum of the tables of the dipoles."""
+        tables = np.moveaxis(self._fields.reduced, 3, 0)
+        feeds = zip(self._amplitudes, tables, strict=True)
+        return np.stack([np.tensordot(weights, table, axes=1) for weights, table in feeds], axis=2)
 
 
 dipole_fields = lru_cache(maxsize=1)(DipoleFields)

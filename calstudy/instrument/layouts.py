@@ -185,13 +185,13 @@ def make_layout(settings: Plugin) -> Layout:
     layout = layout_of(settings)
     with guarded(layout):
         made = layout.make()
-        again = made if type(layout).__module__.startswith("calstudy.") else layout.make()
+        again = made if layout.is_built_in else layout.make()
     for one in (made, again):
         if not isinstance(one, Layout):
             raise InputError(
                 f"{layout.origin}: make returned {one!r}; a Layout is needed, such as self.flat(positions)"
             )
-    _require_valid(made, layout.origin)
+    require_valid(made, layout.origin)
     if not all(np.array_equal(getattr(made, name), getattr(again, name)) for name in ("numbers", "names", "enu")):
         raise InputError(
             f"{layout.origin}: make gives other antennas at every call, and each product would be of another array; "
@@ -200,7 +200,8 @@ def make_layout(settings: Plugin) -> Layout:
     return made
 
 
-def _require_valid(made: Layout, origin: str) -> None:
+def require_valid(made: Layout, origin: str) -> None:
+    """Raise InputError, with where the antennas are from, unless they are what `Layout` says."""
     shape, count = np.shape(made.enu), len(made.numbers)
     if shape != (count, 3) or len(made.names) != count or count < 2:
         raise InputError(

@@ -23,17 +23,11 @@ from calstudy.base.package_files import BEAM
 from calstudy.base.user_code import digest_file
 from calstudy.instrument import beam_frequencies, beam_grid
 from calstudy.instrument.beam_frequencies import FIT_BAND, choose_frequencies, fit_range, megahertz
-from calstudy.instrument.beam_grid import fixed_components
+from calstudy.instrument.beam_grid import DESCRIPTION, describe, fixed_components, tabulate
 
 PIXELS_PER_DEGREE = 1
 
 FIT_ORDER = 8
-
-DESCRIPTION = (
-    *("telescope_name", "feed_name", "feed_version", "model_name", "model_version", "history"),
-    *("feed_array", "feed_angle", "axis1_array", "axis2_array", "basis_vector_array"),
-)
-"""Attributes of a UVBeam that do not depend on its frequencies."""
 
 
 def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
@@ -43,16 +37,11 @@ def mwa_embedded_element(path: Path | None, band: tuple[float, float], interpola
     the margin that a fit needs is read as well. See `TabulatedBeam` for `interpolation`. Raises InputError if the file
     is missing or not of this band.
     """
-    return _of_file("mwa-beam", BEAM.find() if path is None else path, band, interpolation)
+    return beam_of_file("mwa-beam", BEAM.find() if path is None else path, band, interpolation)
 
 
-def beamfits(path: Path, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
-    """Make the beam of a beamfits file; see `mwa_embedded_element`, and `read_beamfits` for what the file may have."""
-    return _of_file("beamfits", path, band, interpolation)
-
-
-def _of_file(kind: str, path: Path, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
-    """Make the beam of a file. Reading it and fitting its table is slow: the fit is kept for later processes."""
+def beam_of_file(kind: str, path: Path, band: tuple[float, float], interpolation: str) -> TabulatedBeam:
+    """Make the beam of a file of a kind in `READERS`. Its fit is slow, and kept for later processes."""
     if not path.is_file():
         raise InputError(f"instrument.beam.path: there is no file {path}")
     return _fitted(kind, path, digest_file(path), band, interpolation)
@@ -124,65 +113,39 @@ class TabulatedBeam:
     the peak. It is a smooth function of frequency; the largest tabulated value (the maximum over pixels and feeds) need
     not be.
 
-    Attributes
-    ----------
-    zenith_angles : in rad, (Nza,)
-    tabulated_frequencies : those in the band, and those next to its ends, in Hz, (Ntab,)
-    fit_error : largest |ΔJ| against the table, relative to the zenith, over directions and `tabulated_frequencies`
+    `zenith_angles` are in rad, (Nza,). `tabulated_frequencies`, (Ntab,), Hz, are those in the band, and those next to
+    its ends; `fit_error` is the largest |ΔJ| against the table there, relative to the zenith.
     """
 
     def __init__(self, fitted: Mapping[str, Any]) -> None:
+        self.fitted = fitted
         self.description = {name: fitted[name] for name in DESCRIPTION}
         self.zenith_angles = fitted["axis2_array"]
         self.tabulated_frequencies, self.fit_error = fitted["tabulated_frequencies"], fitted["fit_error"]
         self.interpolation = FrequencyInterpolation(fitted["tabulated"], fitted["interpolation"])
-        self._band = (float(fitted["tabulated"][0]), float(fitted["tabulated"][-1]))
-        self._reduced = fitted["reduced"]
 
-    def require_within(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return frequencies (Hz) as floats; raises InputError if any is outside the band of the beam."""
+    @property
+    def reduced(self) -> np.ndarray:
+        """The table as `interpolation` has reduced it, (Nreduced, 2, Nfeeds, Nza, Naz)."""
+        return self.fitted["reduced"]
+
+    def jones(self, frequencies: np.ndarray) -> np.ndarray:
+        """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz.
+
+        Raises InputError if any is outside the band of the beam.
+        """
         frequencies = np.asarray(frequencies, dtype=float)
-        low, high = self._band
+        low, high = self.fitted["tabulated"][[0, -1]].tolist()
         if frequencies.min() < low or frequencies.max() > high:
             raise InputError(
                 f"frequencies {megahertz(frequencies.min(), frequencies.max())} are outside the band for which the "
                 f"beam was made, {megahertz(low, high)}"
             )
-        return frequencies
-
-    def jones(self, frequencies: np.ndarray) -> np.ndarray:
-        """Return J of shape (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, at `frequencies` in Hz."""
-        frequencies = self.require_within(frequencies)
-        return self.normalized(self._reduced, frequencies)
-
-    def normalized(self, reduced: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
-        """Return J from a table on the same grid that `interpolation` has reduced; see `jones`."""
-        values = self.interpolation.evaluate(reduced, frequencies)
-        return zenith_normalized(values, self.description["axis1_array"][0])
+        return zenith_normalized(self.interpolation.evaluate(self.reduced, frequencies), self.fitted["axis1_array"][0])
 
     def at(self, frequencies: np.ndarray) -> UVBeam:
         """Return the E-field beam tabulated at `frequencies` in Hz, (Nfreqs,)."""
         return tabulate(self.description, self.jones(frequencies), frequencies)
-
-
-def describe(beam: UVBeam) -> dict[str, Any]:
-    """Return the grid, feeds and names of a beam, for `tabulate`."""
-    return {name: getattr(beam, name) for name in DESCRIPTION}
-
-
-def tabulate(description: Mapping[str, Any], jones: np.ndarray, frequencies: np.ndarray) -> UVBeam:
-    """Return an E-field beam at frequencies in Hz, (Nfreqs,), on the grid of another beam with this description.
-
-    `jones` is (2 [azimuth, zenith angle], Nfeeds, Nfreqs, Nza, Naz), complex, one at the zenith.
-    """
-    return UVBeam.new(
-        **description,
-        data_normalization="peak",
-        freq_array=np.asarray(frequencies, dtype=float),
-        mount_type="fixed",
-        pixel_coordinate_system="az_za",
-        data_array=np.ascontiguousarray(jones),
-    )
 
 
 def zenith_normalized(values: np.ndarray, azimuth: float) -> np.ndarray:

@@ -178,9 +178,7 @@ class SimulateEor(Task, stage="observed-eor", version=3):
         beam, simulation = make_beam(self.beam, self.channels), self.simulation
         accuracy = simulation.nodes.accuracy(eor=True, smooth_beam=model_of(self.beam).smooth)
         chunks = plan_chunks(template, accuracy, simulation.chunks)
-        cubes = [
-            simulate_chunk(simulation.engine, field.sky(chunk.channels), beam, template, chunk) for chunk in chunks
-        ]
+        cubes = [simulate_chunk(simulation.engine, field.sky(chunk.nodes), beam, template, chunk) for chunk in chunks]
         found = from_cube(data, assemble(chunks, cubes))
         found.flag_array[:] = False
         write_visibilities(found, output / VISIBILITIES)

@@ -131,7 +131,7 @@ class SimulateChunk(_Simulated, stage="simulate-chunk", version=4):
         if self.index >= len(component.chunks):
             return {"empty": True}
         chunk = component.chunks[self.index]
-        sky = component.sky(chunk.channels if component.is_eor else slice(None))
+        sky = component.sky(chunk.nodes)
         cube = simulate(component.engine, sky, component.beam, component.as_built, chunk)
         frame = subset_template(component.template, integration_times(component.template), chunk.frequencies)
         write_visibilities(from_cube(frame, cube), output / CHUNK)

@@ -55,16 +55,11 @@ NEIGHBOURS = 1.5
 class Quality:
     """Gains and chi^2 of one polarization. NaN where everything is flagged.
 
-    Attributes
-    ----------
-    antennas, frequency : names of the antennas with solutions, (Nants,), and channels in Hz, (Nfreqs,)
-    gain_by_channel : |g| over the antenna's median, median over integrations, (Nants, Nfreqs)
-    gain_by_antenna : median |g| of each antenna over the median of all antennas, (Nants,)
-    data_by_channel : |V| over that of the median channel, median over baselines and integrations, (Nfreqs,)
-    chi2_by_antenna, chi2_by_channel, chi2_by_integration
-        Mean of |V - g g* F|^2 / sigma^2 over unflagged samples, (Nants,), (Nfreqs,), (Ntimes,). Parameters of the fit
-        are not counted, so that it is slightly below one for noise.
-    noise : the source of sigma, in words
+    `antennas`, (Nants,), are the names of those with solutions, and `frequency` is in Hz, (Nfreqs,). `gain_by_channel`,
+    (Nants, Nfreqs), is |g| over the antenna's median, of the median integration; `gain_by_antenna` that median over
+    that of all antennas; and `data_by_channel` |V| over that of the median channel, the median over baselines and
+    integrations. chi^2 is the mean of |V - g g* F|^2 / sigma^2 over unflagged samples. Parameters of the fit are not
+    counted, so that it is slightly below one for noise. `noise` is the source of sigma, in words.
     """
 
     polarization: str
@@ -112,12 +107,13 @@ class Quality:
         return {
             "polarization": self.polarization,
             "noise": self.noise,
-            "antennas": [str(name) for name in self.antennas],
+            "antennas": self.antennas.tolist(),
             "gain_by_antenna": rounded(self.gain_by_antenna),
             "gain_by_channel": rounded(np.fmax.reduce(self.gain_by_channel, axis=0)),
-            "chi2_by_antenna": rounded(self.chi2_by_antenna),
-            "chi2_by_channel": rounded(self.chi2_by_channel),
-            "chi2_by_integration": rounded(self.chi2_by_integration),
+            **{
+                name: rounded(getattr(self, name))
+                for name in ("chi2_by_antenna", "chi2_by_channel", "chi2_by_integration")
+            },
             "warnings": self.warnings,
         }
 
@@ -190,9 +186,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
 def _mean(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
     """Return the mean of finite values over all axes but those kept, NaN where there is none."""
     axes = tuple(axis for axis in range(values.ndim) if axis not in kept)
-    finite = np.isfinite(values)
-    count = finite.sum(axis=axes)
-    return np.where(count > 0, np.where(finite, values, 0).sum(axis=axes) / np.maximum(count, 1), np.nan)
+    return np.ma.filled(np.ma.masked_invalid(values).mean(axis=axes), np.nan)
 
 
 def _gain_ratios(amplitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

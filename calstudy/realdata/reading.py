@@ -21,11 +21,10 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gain_files import CASACORE
-from calstudy.base.visibilities import keep_compiled_pyuvdata, polarization_names
+from calstudy.base.visibilities import keep_compiled_pyuvdata, polarization_names, positions
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.array_layouts.csv import read_positions
-from calstudy.instrument.layouts import make_layout
-from calstudy.instrument.settings import LAYOUTS
+from calstudy.instrument.layouts import require_valid
 from calstudy.realdata.selection import Selection, select
 
 logger = logging.getLogger(__name__)
@@ -309,12 +308,10 @@ OF_BASELINE = ("ant_1_array", "ant_2_array", "baseline_array", "uvw_array", "int
 def _reindexed(data: UVData, by_time: np.ndarray, by_baseline: np.ndarray) -> UVData:
     """Return data whose sample i is sample by_baseline[i], with the properties of the time from sample by_time[i]."""
     result = data.copy()
-    for parameter in data:
-        values, form = getattr(data, parameter), getattr(data, parameter).form
-        if isinstance(form, tuple) and form[:1] == ("Nblts",) and values.value is not None:
-            own = parameter.lstrip("_") in OF_BASELINE
-            setattr(result, values.name, np.array(values.value[by_baseline if own else by_time]))
-    result.Nblts, result.Ntimes = by_time.size, np.unique(result.time_array).size
+    result._select_along_param_axis({"Nblts": by_time})
+    for name in OF_BASELINE:
+        setattr(result, name, getattr(data, name)[by_baseline])
+    result.Ntimes = np.unique(result.time_array).size
     result.Nbls = result.Nblts // result.Ntimes
     result.blt_order = ("time", "baseline")
     return result
@@ -330,8 +327,8 @@ def place_antennas(data: UVData, path: Path) -> str:
     if any(entry["cat_type"] != "unprojected" for entry in data.phase_center_catalog.values()):
         raise InputError("observed.positions: the data are phased to a source, by the positions that they have")
     try:
-        read_positions(path, numbered=True)
-        layout = make_layout(LAYOUTS.make({"kind": "csv", "path": path}))
+        layout = read_positions(path, numbered=True)
+        require_valid(layout, f"instrument.layout.path: {path}")
     except InputError as error:
         raise InputError(str(error).replace("instrument.layout.path", "observed.positions")) from None
     telescope = data.telescope
@@ -340,15 +337,13 @@ def place_antennas(data: UVData, path: Path) -> str:
     if missing.size:
         raise InputError(f"observed.positions: {path} has no antenna {missing[0]}, which is in the data")
     enu = telescope.get_enu_antpos()
-    places = {int(number): row for row, number in enumerate(layout.numbers)}
-    moved = [row for row, number in enumerate(telescope.antenna_numbers.tolist()) if number in places]
-    before = enu[moved].copy()
-    for row in moved:
-        enu[row] = layout.enu[places[int(telescope.antenna_numbers[row])]]
+    moved = np.isin(telescope.antenna_numbers, layout.numbers)
+    before = enu[moved]
+    enu[moved] = layout.enu[positions(layout.numbers, telescope.antenna_numbers[moved])]
     centre = np.array([axis.to_value(units.m) for axis in telescope.location.geocentric])
     telescope.antenna_positions = utils.ECEF_from_ENU(enu, center_loc=telescope.location) - centre
     data.set_uvws_from_antenna_positions(update_vis=False)
-    distances = [np.linalg.norm(positions[:, None] - positions, axis=-1) for positions in (before, enu[moved])]
+    distances = [np.linalg.norm(places[:, None] - places, axis=-1) for places in (before, enu[moved])]
     return (
         f"Antenna positions are those of {path.name}; distances between antennas change by up to "
         f"{np.abs(distances[1] - distances[0]).max():.3g} m."

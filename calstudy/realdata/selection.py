@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from calstudy.base.constants import SAME_LENGTH
 from calstudy.base.errors import InputError
 from calstudy.base.units import parse_quantity
-from calstudy.base.visibilities import polarization_names
+from calstudy.base.visibilities import polarization_names, positions
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -35,16 +35,9 @@ SAME_FREQUENCY = 1.0
 class Selection:
     """Part of a data set; None everywhere means all of it. Ranges include both ends, None is an open end.
 
-    A length or a frequency that is an end but for rounding is inside.
-
-    Attributes
-    ----------
-    antennas : antenna numbers or names, such as ``1``, ``number:1`` or ``name:1``
-    lengths : baseline lengths in m
-    times : indices of integrations, counted from zero
-    frequencies : channel centres in Hz
-    polarizations : names such as ``xx`` or ``ee``
-    autos : if true, a selection of lengths keeps the autocorrelations of the antennas that are left
+    A length (m) or a frequency (Hz) that is an end but for rounding is inside. Antennas are ``1``, ``number:1`` or
+    ``name:1``, times are indices from zero, and polarizations are ``xx`` or ``ee``. With `autos`, a selection of
+    lengths keeps the autocorrelations of the antennas that are left.
     """
 
     antennas: tuple[str, ...] | None = None
@@ -147,9 +140,9 @@ def _of_length(data: UVData, ends: tuple[float | None, float | None], autos: boo
 
     With `autos` those of the antennas of these baselines are kept, too.
     """
-    positions = dict(zip(data.telescope.antenna_numbers.tolist(), data.telescope.get_enu_antpos(), strict=True))
-    pairs = zip(data.ant_1_array.tolist(), data.ant_2_array.tolist(), strict=True)
-    lengths = np.array([np.linalg.norm(positions[b] - positions[a]) for a, b in pairs])
+    numbers, enu = data.telescope.antenna_numbers, data.telescope.get_enu_antpos()
+    first, second = (enu[positions(numbers, antennas)] for antennas in (data.ant_1_array, data.ant_2_array))
+    lengths = np.linalg.norm(second - first, axis=1)
     chosen = _within(lengths, ends, SAME_LENGTH, "lengths")
     if autos:
         left = np.union1d(data.ant_1_array[chosen], data.ant_2_array[chosen])

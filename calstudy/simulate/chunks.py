@@ -45,8 +45,8 @@ CHECKED = 2
 class Chunk:
     """One piece of a simulation.
 
-    `axis` has all frequency nodes of the simulation, and `nodes` selects those of this chunk. `part` is the index of
-    the part of the sky, and the number of parts.
+    `axis` has all frequency nodes of the simulation, and `nodes` selects those of this chunk: channels, unless sky and
+    beam are smooth. `part` is the index of the part of the sky, and the number of parts.
     """
 
     axis: Axis
@@ -58,13 +58,6 @@ class Chunk:
     def frequencies(self) -> np.ndarray:
         """Frequencies of the nodes of the chunk, (Nf,), Hz."""
         return self.axis.nodes[self.nodes]
-
-    @property
-    def channels(self) -> slice:
-        """Channels of the chunk; raises ValueError if its frequency nodes are not channels."""
-        if not self.axis.at_samples:
-            raise ValueError("the chunk's frequency nodes are not channels, the sky must be smooth in frequency for it")
-        return self.nodes
 
     def select(self, sky: SkyModel) -> SkyModel | None:
         """Select the chunk's part of a sky, or None if it is empty; every n-th cell of a grid, for equal times."""
@@ -141,20 +134,12 @@ def check_interpolation(
     channels: slice = slice(None),
     count: int = 3,
 ) -> dict[str, Any]:
-    """Compare interpolated visibilities with a direct simulation where the error should be largest.
+    """Compare interpolated visibilities, (Ntimes, Nbls, Nfreqs, Npols), with direct ones where the error is largest.
 
-    Errors, the largest and the rms, are relative to the rms of the visibilities, and of all combinations of a few
-    integrations (Julian dates) and channels (Hz). They are returned with the numbers of nodes, as plain JSON types.
-
-    Parameters
-    ----------
-    simulate
-        Returns the visibilities at the integrations and channels of a template, (Ntimes, Nbls, Nfreqs, Npols): an
-        engine's `simulate` with the sky and beam of the simulation.
-    cube : interpolated visibilities at all channels, (Ntimes, Nbls, Nfreqs, Npols)
-    chunk : any chunk of the simulation, for its nodes
-    channels : channels to choose from: those of the sky, if it is given channel by channel
-    count : number of integrations, and of channels, spread over the observation; each is as far from nodes as possible
+    These are of all combinations of `count` integrations and channels, spread over the observation and each as far from
+    the nodes of `chunk` as possible, of the `channels` that the sky has. `simulate` gives the visibilities of a
+    template. Errors, the largest and the rms, are relative to the rms of the visibilities. They are returned with the
+    times (Julian dates), the channels (Hz) and the numbers of nodes, as plain JSON types.
     """
     times, frequencies = integration_times(template), template.freq_array
     nodes = time_axis(template, chunk.accuracy).nodes
@@ -213,15 +198,9 @@ class Component:
         return [note for note in (sky, self.beam.stand_in, self.instrument.as_built.note) if note]
 
     @cached_property
-    def _field(self) -> EorField | None:
-        if not isinstance(self._sky, Eor):
-            return None
-        return EorField(self._sky, self.template.freq_array, make_cosmology(self._cosmology))
-
-    @cached_property
-    def _foregrounds(self) -> SkyModel:
+    def _source(self) -> EorField | SkyModel:
         if isinstance(self._sky, Eor):
-            raise TypeError("the EoR has no foregrounds")
+            return EorField(self._sky, self.template.freq_array, make_cosmology(self._cosmology))
         foregrounds = make_foregrounds(self._sky, self.template.freq_array, self._diffuse)
         self.stand_ins = self._notes(foregrounds.stand_in)
         return foregrounds.sky
@@ -231,7 +210,7 @@ class Component:
         """Tolerance of the interpolation, and whether beam and sky are smooth in frequency."""
         beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
         smooth_beam = all(model_of(beam).smooth for beam in beams)
-        smooth_sky = not self.is_eor and self._foregrounds.spectral_type in SMOOTH_SPECTRA
+        smooth_sky = getattr(self._source, "spectral_type", None) in SMOOTH_SPECTRA
         return self.simulation.nodes.accuracy(self.is_eor, smooth_beam, smooth_sky)
 
     @cached_property
@@ -241,7 +220,7 @@ class Component:
 
     def sky(self, channels: slice | np.ndarray) -> SkyModel:
         """Return the sky; for the EoR only at the given channels."""
-        return self._foregrounds if self._field is None else self._field.sky(channels)
+        return self._source.sky(channels) if isinstance(self._source, EorField) else self._source
 
     def interpolation_error(self, cube: np.ndarray) -> dict[str, Any] | None:
         """Compare interpolated visibilities, (Ntimes, Nbls, Nfreqs, Npols), Jy, with directly simulated ones.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.signal import windows
+from scipy.signal import get_window
 
 from calstudy.base.visibilities import baseline_vectors, to_cube
 from calstudy.power.delay import horizon_delay
@@ -22,24 +22,16 @@ if TYPE_CHECKING:
 Taper = Literal["blackman-harris", "dolph-chebyshev"]
 MAIN_LOBES: dict[Taper, int] = {"blackman-harris": 4, "dolph-chebyshev": 8}
 """Half width of the main lobe of each taper, in units of 1 / bandwidth; the floor is measured beyond it."""
-
-SIDELOBES = 200
-"""Attenuation of the sidelobes of the Dolph-Chebyshev taper, in dB of power."""
-
-
-def make_window(taper: Taper, n_channels: int) -> np.ndarray:
-    """Return the taper, (n_channels,)."""
-    if taper == "blackman-harris":
-        return windows.blackmanharris(n_channels)
-    return windows.chebwin(n_channels, SIDELOBES)
+WINDOWS = {"blackman-harris": "blackmanharris", "dolph-chebyshev": ("chebwin", 200)}
+"""Tapers of scipy; the attenuation of the sidelobes of the second is in dB of power."""
 
 
 @dataclass(frozen=True)
 class DelayFloor:
     """Power beyond the horizon plus a buffer (s) relative to the peak, in bins of baseline length with edges in m.
 
-    `rms_db`, (Nbins,), is the rms beyond horizon + buffer over the largest rms at any delay, in amplitude dB, and NaN
-    for an empty bin. `max_db`, (Nbins,), is the same for the delay with the largest rms beyond horizon + buffer.
+    `rms_db` and `max_db`, (Nbins,), are the rms beyond horizon + buffer, and that of the delay where it is largest
+    there, over the largest rms at any delay, in amplitude dB; NaN for an empty bin.
     """
 
     edges: np.ndarray
@@ -61,7 +53,8 @@ def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.nda
     """
     cube = to_cube(foregrounds)
     width = float(np.diff(foregrounds.freq_array).mean())
-    spectrum = np.fft.fft(cube * make_window(taper, cube.shape[2])[:, None], axis=2)
+    window = get_window(WINDOWS[taper], cube.shape[2], fftbins=False)
+    spectrum = np.fft.fft(cube * window[:, None], axis=2)
     return np.fft.fftfreq(cube.shape[2], width), np.mean(np.abs(spectrum) ** 2, axis=(0, 3))
 
 
@@ -96,20 +89,11 @@ def delay_floor(
     n_bins: int = 6,
     peaks: UVData | None = None,
 ) -> DelayFloor:
-    """Measure the delay floor of simulated foregrounds.
+    """Measure the delay floor of foregrounds alone, with equally spaced channels, beyond horizon + buffer (s).
 
-    Raises ValueError if no delay is beyond horizon + buffer for the longest baseline.
-
-    Parameters
-    ----------
-    foregrounds : visibilities of foregrounds alone, with equally spaced channels
-    buffer
-        Delay beyond the horizon from which the floor is measured, s. The main lobe of the taper extends to 4 /
-        bandwidth (130 ns for 30.72 MHz) for Blackman-Harris, and to 8 / bandwidth (250 ns) for Dolph-Chebyshev.
-    taper
-        `blackman-harris` has sidelobes of -46 dB here and gives the floor of a power spectrum; `dolph-chebyshev`
-        (-100 dB) gives the floor of the simulation below these sidelobes.
-    peaks : visibilities that define the peaks, of the same shape; by default `foregrounds`
+    Blackman-Harris has sidelobes of -46 dB here and gives the floor of a power spectrum; Dolph-Chebyshev (-100 dB)
+    gives the floor of the simulation below these sidelobes. `peaks` are the visibilities that define the peaks, of the
+    same shape; by default `foregrounds`. Raises ValueError if no delay is beyond that for the longest baseline.
     """
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
     delays, power = delay_profile(foregrounds, taper)

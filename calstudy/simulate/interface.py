@@ -24,16 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SimulationSize:
-    """Size of a simulation, from which an engine estimates its cost.
+    """Numbers of components of the sky, above and below the horizon, of antennas, and of distinct beams.
 
-    Attributes
-    ----------
-    sources : number of components of the sky, above and below the horizon
-    slots : number of combinations of time and frequency nodes
-    patch_slots : the same for each patch of neighbouring sources (`calstudy.simulate.patches`)
-    beams : number of distinct beams
-    tolerance : tolerance of the interpolation, 0 for none
-    regular : whether the antennas are on a flat lattice
+    `slots` is the number of combinations of time and frequency nodes, `patch_slots` that of each patch of neighbouring
+    sources (`calstudy.simulate.patches`). `regular` antennas are on a flat lattice; without interpolation `tolerance`
+    is 0.
     """
 
     sources: float
@@ -103,6 +98,26 @@ class Engine(Plugin, ABC):
     def cost(self, size: SimulationSize) -> Cost:
         """Estimate the cost beyond that of holding sky and visibilities; the default is that of matrix products."""
         return Cost((3e-6 + 3.2e-9 * size.antennas**2) * size.sources * size.slots)
+
+
+def polarization_feeds(template: UVData) -> list[str]:
+    """Return the feed of each polarization; raises InputError for cross-hand or circular ones."""
+    feeds = {-5: "x", -6: "y"}
+    unknown = [int(number) for number in template.polarization_array if int(number) not in feeds]
+    if unknown:
+        raise InputError(f"polarization number {unknown[0]} is not xx (-5) or yy (-6)")
+    return [feeds[int(number)] for number in template.polarization_array]
+
+
+def refusal_of_polarization(sky: SkyModel, template: UVData) -> str | None:
+    """Return the reason why an engine of Stokes I in xx and yy does not support a simulation, or None if it does."""
+    if np.any(sky.stokes[1:].value):
+        return "the sky is polarized, an unpolarized one is needed"
+    try:
+        polarization_feeds(template)
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def simulate_with(

@@ -32,15 +32,11 @@ PATCH_SOURCES = 700
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of interpolated visibilities, and the smoothness on which the interpolation depends.
+    """Accuracy of interpolated visibilities, and whether beam and fluxes vary smoothly with frequency.
 
-    Attributes
-    ----------
-    tolerance
-        Interpolation error of the visibilities, relative to their rms, if all fringes were as fast as the fastest one;
-        with 0 nothing is interpolated.
-    beam_extent : length in m added to each baseline for the structure of the beam in fringe rate and delay
-    smooth_beam, smooth_sky : whether the beam, and the fluxes of the sky, vary smoothly with frequency
+    `tolerance` is the error relative to the rms of the visibilities if all fringes were as fast as the fastest one;
+    with 0 nothing is interpolated. `beam_extent`, m, is added to each baseline for the structure of the beam in fringe
+    rate and delay.
     """
 
     tolerance: float
@@ -78,10 +74,9 @@ class Axis:
 
 
 def make_axis(samples: np.ndarray, bandwidth: float, tolerance: float) -> Axis:
-    """Choose the nodes from which phasors are interpolated to ascending samples, (m,).
+    """Choose the nodes from which phasors are interpolated to ascending samples, (m,), to a tolerance.
 
-    The tolerance is that of `chebyshev_count`. With a tolerance of 0, or if as many nodes as samples are needed, the
-    nodes are the samples.
+    With a tolerance of 0, or if as many nodes as samples are needed, the nodes are the samples.
     """
     count = chebyshev_count(bandwidth, tolerance) if tolerance else len(samples)
     if count >= len(samples):
@@ -113,9 +108,8 @@ def chebyshev_nodes(first: float, last: float, count: int) -> np.ndarray:
 def interpolation_matrix(nodes: np.ndarray, samples: np.ndarray) -> np.ndarray:
     """Return the matrix (m, n) from values at the nodes to those of their interpolating polynomial at the samples (m,).
 
-    It is the barycentric interpolation of the second kind (Berrut & Trefethen 2004). The nodes, (n,), are distinct, and
-    near Chebyshev nodes for a well-conditioned result. They need not be exact: a Julian date holds a time only to 40
-    us, so the weights are computed from the rounded nodes.
+    It is the barycentric interpolation of the second kind (Berrut & Trefethen 2004). The nodes, (n,), are near those of
+    Chebyshev; a Julian date holds a time only to 40 us, so the weights are computed from the rounded nodes.
     """
     centre = nodes[len(nodes) // 2]
     half = np.ptp(np.concatenate([nodes, samples])) / 2 or 1.0
@@ -144,8 +138,7 @@ def time_axis(template: UVData, accuracy: Accuracy) -> Axis:
 def frequency_axis(template: UVData, accuracy: Accuracy, radius: float = 1.0) -> Axis:
     """Choose the frequencies at which a sky is simulated: every channel, unless sky and beam are smooth.
 
-    `radius` is the largest distance of a source from the direction to which fringes are relative, rad; it is 1 for the
-    zenith.
+    `radius` is the largest distance of a source from the direction to which fringes are relative, rad; 1: the zenith.
     """
     channels = template.freq_array
     smooth = accuracy.smooth_beam and accuracy.smooth_sky

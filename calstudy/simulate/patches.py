@@ -30,10 +30,10 @@ from pyuvdata import UVData
 from threadpoolctl import threadpool_limits
 
 from calstudy.base.constants import SPEED_OF_LIGHT
-from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, require_rectangular
 from calstudy.instrument.antenna_beams import split_beams
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams
+from calstudy.simulate.interface import polarization_feeds
 from calstudy.simulate.nodes import (
     SINGLE_PRECISION,
     Accuracy,
@@ -67,8 +67,8 @@ def visibilities(
     """Simulate an unpolarized sky, (Ntimes, Nbls, Nfreqs, Npols) complex128, Jy.
 
     With a tolerance of 0 every source is simulated at every integration and channel. `dtype` is the precision of the
-    products, float64 or float32; by default single precision if the tolerance allows it. Raises InputError if a
-    polarization is not xx or yy, or `calstudy.simulate.patterns.power_pattern` does not support the beam.
+    products, float64 or float32; by default single precision if the tolerance allows it. Raises InputError if
+    polarizations or beam are not supported.
     """
     array = PatchedArray(beam, template, accuracy)
     dtype = dtype or (np.float32 if accuracy.tolerance >= SINGLE_PRECISION else np.float64)
@@ -96,13 +96,9 @@ def visibilities(
 class Patches:
     """Sources sorted by patch of the sky; the patches are the cells of a grid, or one patch if `nside` is 0.
 
-    Attributes
-    ----------
-    components : the components in the order of the patches, (N,) int
-    tracks : tracks of these components, in this order
-    members : slice of the components of each patch
-    centres : tracks of the mean directions of the patches, which are fixed points of the sky, as sources are
-    radii : largest distance of a source from the centre of its patch, rad, (Npatches,)
+    `components`, (N,), and their `tracks` are in the order of the patches, each of which has a slice in `members`. Its
+    centre is the mean direction, a fixed point of the sky as sources are. `radii`, (Npatches,), are the largest
+    distances of a source from the centre of its patch, rad.
     """
 
     def __init__(self, sky: SkyModel, tracks: SourceTracks, components: np.ndarray, nside: int) -> None:
@@ -117,15 +113,6 @@ class Patches:
         self.centres = SourceTracks(tracks.nodes, centres)
         offsets = self.tracks.vectors[0] - np.repeat(centres[0], sizes, axis=1)
         self.radii = np.maximum.reduceat(np.linalg.norm(offsets, axis=0), starts)
-
-
-def polarization_feeds(template: UVData) -> list[str]:
-    """Return the feed of each polarization; raises InputError for cross-hand or circular ones."""
-    feeds = {-5: "x", -6: "y"}
-    unknown = [int(number) for number in template.polarization_array if int(number) not in feeds]
-    if unknown:
-        raise InputError(f"polarization number {unknown[0]} is not xx (-5) or yy (-6)")
-    return [feeds[int(number)] for number in template.polarization_array]
 
 
 class PatchedArray:

@@ -31,8 +31,7 @@ class Pattern(Protocol):
 def power_pattern(beam: UVBeam | AnalyticBeam, frequencies: np.ndarray, feeds: list[str]) -> Pattern:
     """Return the power pattern of some feeds, such as "x" and "y", of an E-field beam at frequencies in Hz, (Nfreqs,).
 
-    Raises InputError if the beam is not an E-field beam with these feeds, or is a tabulated one that is not
-    peak-normalized, not on a regular grid in azimuth and zenith angle, or not at these frequencies.
+    Raises InputError with the reason of `refusal`, or if a table is not at these frequencies.
     """
     reason = refusal(beam, feeds)
     if reason:
@@ -53,12 +52,10 @@ def refusal(beam: UVBeam | AnalyticBeam, feeds: list[str]) -> str | None:
         return f"the beam has no feed {', '.join(missing)}, only {', '.join(beam.feed_array)}"
     if not isinstance(beam, UVBeam):
         return None
-    if beam.beam_type != "efield":
-        return f"the beam is a {beam.beam_type} beam, an E-field beam is needed"
-    if beam.data_normalization != "peak":
-        return f"the beam's normalization is {beam.data_normalization}, peak is needed"
-    if beam.pixel_coordinate_system != "az_za":
-        return f"the beam is on a {beam.pixel_coordinate_system} grid, azimuth and zenith angle are needed"
+    needed = {"beam_type": "efield", "data_normalization": "peak", "pixel_coordinate_system": "az_za"}
+    for name, value in needed.items():
+        if getattr(beam, name) != value:
+            return f"the beam's {name} is {getattr(beam, name)}, {value} is needed"
     return None
 
 

@@ -55,16 +55,10 @@ TAYLOR: dict[type, tuple[tuple, tuple]] = {np.float64: _taylor(np.float64, 12), 
 
 @dataclass(frozen=True)
 class PairSums:
-    """Visibilities of all baselines of an array, summed over sources.
+    """Visibilities of all baselines at `frequencies` (Hz, ascending), summed over sources in a precision `dtype`.
 
-    Attributes
-    ----------
-    delays : positions of the antennas over the speed of light, s, in east, north, up, (Nants, 3)
-    pairs : first and second antenna of each baseline, two arrays (Nbls,) int
-    frequencies : in Hz, ascending, (Nfreqs,)
-    patterns : distinct beams at these frequencies
-    index : index of the beam of each antenna, (Nants,) int
-    dtype : precision of the products, float64 or float32
+    `delays` are the positions of the antennas over the speed of light, s, in east, north, up, (Nants, 3), `pairs` the
+    first and the second antenna of each baseline, (Nbls,) each, and `index` is that of the pattern of each antenna.
     """
 
     delays: np.ndarray
@@ -240,8 +234,7 @@ def _field_factors(
 ) -> None:
     """Fill right (Nants, 4 N) with C and S of both components of X, left with w (C - S) and w (C + S) of them.
 
-    `fringes` are cosine and sine, (2, Nants, N), and `fields` those of the beams, (Nbeams, 4, N): real and imaginary
-    part of one component, then of the other.
+    `fringes` are (2, Nants, N), and `fields` (Nbeams, 4, N): real and imaginary part of one component, then the other.
     """
     n_sources = flux.size
     for antenna in range(len(index)):

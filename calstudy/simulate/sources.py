@@ -21,11 +21,6 @@ from calstudy.simulate.nodes import EARTH_ROTATION_RATE, chebyshev_count, chebys
 from calstudy.sky.spectra import at_frequencies
 
 
-def is_polarized(sky: SkyModel) -> bool:
-    """Return whether any component has Stokes Q, U or V."""
-    return bool(np.any(sky.stokes[1:].value))
-
-
 def stokes_i(sky: SkyModel, frequencies: np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
     """Return Stokes I of a sky in Jy, (Nfreqs, Ncomponents), with the same conventions as pyuvsim.
 
@@ -76,9 +71,6 @@ def _jansky_factor(sky: SkyModel, frequencies: np.ndarray, components: np.ndarra
 # A direction is a unit vector that turns with the Earth; this is its rounding error.
 DIRECTION_TOLERANCE = 1e-15
 
-# Celestial frames that are defined by their name alone.
-FRAMES = ("icrs", "galactic")
-
 # A source this close to the horizon may rise or set between two of the sampled times (rad).
 HORIZON_MARGIN = 1e-6
 
@@ -104,7 +96,7 @@ class SourceTracks:
         nodes = distinct if count >= len(distinct) else chebyshev_nodes(distinct[0], distinct[-1], count)
         if _is_whole_map(sky):
             place = tuple(axis.to_value("m") for axis in location.geocentric)
-            return cls(nodes, _map_vectors(sky.nside, sky.hpx_order, sky.hpx_frame.name, place, tuple(nodes)))
+            return cls(nodes, _map_vectors(sky.nside, place, tuple(nodes)))
         return cls(nodes, _vectors(sky_coordinates(sky), location, nodes))
 
     def at(self, times_jd: float | np.ndarray, components: np.ndarray | slice = slice(None)) -> np.ndarray:
@@ -119,10 +111,10 @@ class SourceTracks:
 
 
 def _is_whole_map(sky: SkyModel) -> bool:
-    """Return whether a sky is a HEALPix map whose directions follow from its resolution, order and frame alone."""
+    """Return whether a sky is a whole HEALPix map in RING order, ICRS: its resolution tells its directions."""
     return (
         sky.component_type == "healpix"
-        and sky.hpx_frame.name in FRAMES
+        and (sky.hpx_frame.name, sky.hpx_order) == ("icrs", "ring")
         and np.array_equal(sky.hpx_inds, np.arange(12 * sky.nside**2))
     )
 
@@ -136,12 +128,10 @@ def sky_coordinates(sky: SkyModel) -> SkyCoord:
 
 # All channels of the EoR have the same pixels, whose transformation takes a tenth of the time of a chunk.
 @lru_cache(maxsize=1)
-def _map_vectors(
-    nside: int, order: str, frame: str, place: tuple[float, float, float], nodes: tuple[float, ...]
-) -> np.ndarray:
+def _map_vectors(nside: int, place: tuple[float, float, float], nodes: tuple[float, ...]) -> np.ndarray:
     """Return the directions of all pixels of a map, (Nnodes, 3, Npixels), read-only."""
-    longitude, latitude = healpy.pix2ang(nside, np.arange(12 * nside**2), nest=order == "nested", lonlat=True)
-    coordinates = SkyCoord(longitude, latitude, unit="deg", frame=frame)
+    longitude, latitude = healpy.pix2ang(nside, np.arange(12 * nside**2), lonlat=True)
+    coordinates = SkyCoord(longitude, latitude, unit="deg", frame="icrs")
     vectors = _vectors(coordinates, EarthLocation.from_geocentric(*place, unit="m"), np.array(nodes))
     vectors.flags.writeable = False
     return vectors
@@ -149,14 +139,12 @@ def _map_vectors(
 
 def _vectors(coordinates: SkyCoord, location: EarthLocation, nodes: np.ndarray) -> np.ndarray:
     use_bundled_earth_orientation()
-    return np.stack([_enu(coordinates, location, time) for time in nodes])
-
-
-def _enu(coordinates: SkyCoord, location: EarthLocation, time_jd: float) -> np.ndarray:
-    time = Time(time_jd, format="jd", scale="utc", location=location)
-    local = coordinates.transform_to(AltAz(obstime=time, location=location))
-    altitude, azimuth = local.alt.rad, local.az.rad
-    return np.stack([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+    found = []
+    for time in Time(nodes, format="jd", scale="utc", location=location):
+        local = coordinates.transform_to(AltAz(obstime=time, location=location))
+        altitude, azimuth = local.alt.rad, local.az.rad
+        found.append([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+    return np.array(found)
 
 
 def split_by_horizon(tracks: SourceTracks, times_jd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import warnings
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -33,25 +32,14 @@ GLEAM_COLUMNS = {
 }
 
 
-@dataclass(frozen=True)
-class Catalogue:
-    """Point sources with power-law spectra, S(ν) = flux (ν / 200 MHz)^spectral_index; all arrays are (Nsources,).
+def make_catalogue(*columns: np.ndarray) -> np.recarray:
+    """Return point sources with power-law spectra, S(ν) = flux (ν / 200 MHz)^spectral_index, (Nsources,).
 
-    Positions are ICRS in radians, and fluxes are Stokes I at 200 MHz in Jy.
+    The columns are names, right_ascension and declination (ICRS, rad), flux (Stokes I at 200 MHz, Jy) and
+    spectral_index.
     """
-
-    names: np.ndarray
-    right_ascension: np.ndarray
-    declination: np.ndarray
-    flux: np.ndarray
-    spectral_index: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.flux)
-
-    def select(self, chosen: np.ndarray) -> Catalogue:
-        """Return the sources selected by a boolean or index array."""
-        return Catalogue(*(getattr(self, field.name)[chosen] for field in fields(self)))
+    names = ("names", "right_ascension", "declination", "flux", "spectral_index")
+    return np.rec.fromarrays(columns, dtype=[(n, column.dtype) for n, column in zip(names, columns, strict=True)])
 
 
 def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
@@ -68,14 +56,8 @@ def brightest(flux: np.ndarray, settings: PointSources) -> np.ndarray:
     return order
 
 
-def concatenate(*catalogues: Catalogue) -> Catalogue:
-    """Join several catalogues."""
-    names = [field.name for field in fields(Catalogue)]
-    return Catalogue(*(np.concatenate([getattr(part, name) for part in catalogues]) for name in names))
-
-
-def read_gleam_table(path: Path) -> Catalogue:
-    """Read a table with the columns of the GLEAM catalogue (VOTable or FITS).
+def read_gleam_table(path: Path) -> np.recarray:
+    """Read a table with the columns of the GLEAM catalogue (VOTable or FITS) into a catalogue.
 
     Fluxes are the integrated ones of the wide-band image (170 to 231 MHz, effectively 200 MHz). Sources without a
     fitted spectral index get the mean one, -0.8; sources without a flux are left out. Raises InputError if the file is
@@ -97,16 +79,14 @@ def read_gleam_table(path: Path) -> Catalogue:
     if missing:
         raise InputError(f"sky.foregrounds.path: {path} is not a GLEAM catalogue, it lacks {', '.join(missing)}")
     try:
-        columns: dict[str, np.ndarray] = {
-            key: np.ma.filled(np.ma.asarray(table[found[key]], dtype=float), np.nan) for key in list(found)[1:]
-        }
+        columns = {key: _numbers(table, str(found[key])) for key in list(found)[1:]}
     except (ValueError, TypeError) as error:
         raise InputError(
             f"sky.foregrounds.path: {path} has text where a GLEAM catalogue has numbers ({error})"
         ) from None
     if (np.abs(columns["declination"]) > 90).any():
         raise InputError(f"sky.foregrounds.path: {path} has declinations beyond 90 deg")
-    catalogue = Catalogue(
+    catalogue = make_catalogue(
         np.asarray(table[found["name"]]).astype(str),
         np.deg2rad(columns["right_ascension"]),
         np.deg2rad(columns["declination"]),
@@ -115,7 +95,12 @@ def read_gleam_table(path: Path) -> Catalogue:
     )
     measured = np.isfinite(catalogue.flux)
     LOG.info("%s: %d sources, %d of them with a wide-band flux", path, len(catalogue), measured.sum())
-    return catalogue.select(measured)
+    return catalogue[measured]
+
+
+def _numbers(table: Table, column: str) -> np.ndarray:
+    """Return a column as floats, NaN where it is masked; raises ValueError or TypeError for text."""
+    return np.ma.filled(np.ma.asarray(table[column], dtype=float), np.nan)
 
 
 def with_errors(sky: SkyModel, errors: CatalogueErrors) -> SkyModel:
@@ -141,36 +126,54 @@ def _tilt(sky: SkyModel, change: np.ndarray) -> None:
         raise InputError(
             f"sky.foregrounds.errors.index_scatter: needs flat or power-law spectra, those here are {sky.spectral_type}"
         )
-    if sky.spectral_type == "flat":
-        sky.spectral_type, sky.spectral_index = "spectral_index", np.zeros(sky.Ncomponents)
-        sky.reference_frequency = np.full(sky.Ncomponents, FREQUENCY) * units.Hz
+    make_power_law(sky)
     sky.stokes = sky.stokes * (sky.reference_frequency.to_value("Hz") / FREQUENCY) ** change
     sky.spectral_index = sky.spectral_index + change
 
 
-def to_sky_model(catalogue: Catalogue, settings: PointSources) -> SkyModel:
+def make_power_law(sky: SkyModel) -> None:
+    """Give a sky of flat spectra spectral indices of zero, in place."""
+    if sky.spectral_type == "flat":
+        sky.spectral_type, sky.spectral_index = "spectral_index", np.zeros(sky.Ncomponents)
+        sky.reference_frequency = np.full(sky.Ncomponents, FREQUENCY) * units.Hz
+
+
+def power_law(index: np.ndarray, frequency: float) -> dict[str, Any]:
+    """Return the arguments of a sky model for spectral indices about fluxes at one frequency in Hz."""
+    reference = np.full(len(index), frequency) * units.Hz
+    return {"spectral_type": "spectral_index", "spectral_index": index, "reference_frequency": reference}
+
+
+def to_sky_model(catalogue: np.recarray, settings: PointSources) -> SkyModel:
     """Return the sources as point components, with spectra according to the settings."""
-    spectrum: dict[str, Any] = {"spectral_type": "flat"}
-    if settings.spectrum == "catalogue":
-        spectrum = {
-            "spectral_type": "spectral_index",
-            "spectral_index": catalogue.spectral_index,
-            "reference_frequency": np.full(len(catalogue), FREQUENCY) * units.Hz,
-        }
+    flat = settings.spectrum == "flat"
+    spectrum = {"spectral_type": "flat"} if flat else power_law(catalogue.spectral_index, FREQUENCY)
     directions = SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs")
-    return _points(catalogue.names, directions, catalogue.flux, spectrum)
+    return make_points(catalogue.names, directions, unpolarized(catalogue.flux), spectrum)
 
 
-def _points(names: np.ndarray, directions: SkyCoord, flux: np.ndarray, spectrum: dict[str, Any]) -> SkyModel:
-    """Return unpolarized points with fluxes in Jy, and other arguments of a sky model for their spectra."""
-    stokes = np.zeros((4, 1, len(flux))) * units.Jy
-    stokes[0, 0] = flux * units.Jy
+def unpolarized(flux: np.ndarray) -> units.Quantity:
+    """Return the Stokes parameters, (4, 1, Nsources), of flux densities in Jy, (Nsources,)."""
+    stokes = np.zeros((4, 1, len(flux)))
+    stokes[0, 0] = flux
+    return stokes * units.Jy
+
+
+def make_points(
+    names: np.ndarray,
+    directions: SkyCoord,
+    stokes: units.Quantity,
+    spectrum: dict[str, Any],
+    may_be_negative: bool = False,
+) -> SkyModel:
+    """Return points, with other arguments of a sky model for their spectra; negative fluxes may be warned of."""
     return SkyModel(
-        name=names.astype(str),
+        name=np.asarray(names).astype(str),
         skycoord=directions,
         stokes=stokes,
         component_type="point",
         history="calstudy foregrounds",
+        run_check_acceptability=not may_be_negative,
         **spectrum,
     )
 
@@ -188,9 +191,7 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
     missing = [name for name in named.values() if name not in table.colnames]
     if missing:
         raise ValueError(f"there is no column {missing[0]}, only {', '.join(table.colnames)}")
-    values: dict[str, np.ndarray] = {
-        key: np.ma.filled(np.ma.asarray(table[name], dtype=float), np.nan) for key, name in named.items()
-    }
+    values = {key: _numbers(table, name) for key, name in named.items()}
     usable = np.isfinite([values[key] for key in ("right_ascension", "declination", "flux")]).all(axis=0)
     if not usable.any():
         raise ValueError("it holds no source: no row has a position and a flux density; give at least one such row")
@@ -203,10 +204,9 @@ def read_csv_catalogue(path: Path, columns: CsvColumns) -> SkyModel:
                 f"{lacking.sum()} sources have no spectral index, such as that of row {row}; give all of them one, or "
                 "leave out csv.spectral_index"
             )
-        spectrum = {"spectral_type": "spectral_index", "spectral_index": values["spectral_index"]}
-    spectrum["reference_frequency"] = np.full(len(values["flux"]), columns.frequency) * units.Hz
+        spectrum = power_law(values["spectral_index"], columns.frequency)
     directions = SkyCoord(values["right_ascension"], values["declination"], unit="deg", frame="icrs")
-    return _points(np.flatnonzero(usable), directions, values["flux"], spectrum)
+    return make_points(np.flatnonzero(usable), directions, unpolarized(values["flux"]), spectrum)
 
 
 # Hurley-Walker et al. (2017), second release.
@@ -217,18 +217,12 @@ GLEAM_URL = (
 GLEAM_SOURCES = 307_455
 
 
-def gleam_path() -> Path:
-    """Return the default path of the catalogue that `fetch_gleam` downloads."""
-    return default_directory() / GLEAM_FILE
-
-
 def fetch_gleam(directory: Path | None = None, progress: bool = True) -> Path:
     """Download the GLEAM extragalactic catalogue from VizieR, or verify an existing copy, and return its path.
 
     VizieR generates the table for every request and publishes no hash of it. The first download is accepted if it has
-    the required columns and the published number of sources, 307,455. Its SHA-256 is then saved next to it, and
-    checked at every later use. The directory is by default `default_directory`, and is created if necessary. Raises
-    InputError if the download fails or is not the catalogue, or if the copy has changed since it was downloaded.
+    the required columns and the published number of sources. Its SHA-256 is then saved next to it, and checked at every
+    later use. Raises InputError if the download fails or is not the catalogue, or if the copy has changed.
     """
     directory = default_directory() if directory is None else directory
     path = directory / GLEAM_FILE

@@ -30,33 +30,24 @@ def expected_sources(faint: float, bright: float = BRIGHTEST) -> float:
     return float(FULL_SKY * np.trapezoid(differential_counts(edges), edges))
 
 
-def draw_fluxes(faint: float, bright: float, seed: int) -> list[tuple[np.ndarray, np.random.Generator]]:
-    """Draw the fluxes in Jy of an all-sky population between two fluxes at 200 MHz, in bins of flux.
-
-    Each bin also has the random generator for other properties of its sources. Every bin has its own random stream, so
-    that the bright sources do not depend on the faint limit.
-    """
-    lowest, highest = (int(np.floor(np.log10(flux) * BINS_PER_DECADE)) for flux in (faint, bright))
-    population = []
-    for number in range(lowest, highest + 1):
-        edges = 10.0 ** np.linspace(number / BINS_PER_DECADE, (number + 1) / BINS_PER_DECADE, POINTS_PER_BIN + 1)
-        steps = np.diff(edges) * (differential_counts(edges[:-1]) + differential_counts(edges[1:])) / 2
-        cumulative = np.concatenate([[0.0], np.cumsum(steps)]) * FULL_SKY
-        # A spawn key must not be negative, but the numbers of bins below 1 Jy are.
-        generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number + 1000,)))
-        drawn = generator.uniform(0, cumulative[-1], generator.poisson(cumulative[-1]))
-        population.append((np.interp(drawn, cumulative, edges), generator))
-    return population
-
-
 def draw_population(faint: float, bright: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw an all-sky, isotropic population of sources between two fluxes at 200 MHz in Jy.
 
     Return right ascension and declination in radians and flux at 200 MHz in Jy, (Nsources,) each. The counts are
-    measured from 0.81 mJy to 61 Jy at this frequency.
+    measured from 0.81 mJy to 61 Jy at this frequency. Every bin of flux has its own random stream, so that the bright
+    sources do not depend on the faint limit.
     """
+    from scipy.integrate import cumulative_trapezoid
+
+    lowest, highest = (int(np.floor(np.log10(flux) * BINS_PER_DECADE)) for flux in (faint, bright))
     parts = []
-    for flux, generator in draw_fluxes(faint, bright, seed):
+    for number in range(lowest, highest + 1):
+        edges = 10.0 ** np.linspace(number / BINS_PER_DECADE, (number + 1) / BINS_PER_DECADE, POINTS_PER_BIN + 1)
+        cumulative = cumulative_trapezoid(differential_counts(edges), edges, initial=0.0) * FULL_SKY
+        # A spawn key must not be negative, but the numbers of bins below 1 Jy are.
+        generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number + 1000,)))
+        drawn = generator.uniform(0, cumulative[-1], generator.poisson(cumulative[-1]))
+        flux = np.interp(drawn, cumulative, edges)
         right_ascension = generator.uniform(0, 2 * np.pi, len(flux))
         declination = np.arcsin(generator.uniform(-1, 1, len(flux)))
         kept = (flux >= faint) & (flux < bright)

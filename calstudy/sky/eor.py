@@ -162,20 +162,16 @@ def input_power(settings: Eor, k: np.ndarray, hubble: float, band: tuple[float, 
     which choose the part of a lightcone; only a box needs it. Raises InputError if a table or a box cannot be used.
     """
     k = np.asarray(k, dtype=float)
-    if settings.path is not None:
-        path, boxed = settings.path, settings.spectrum == "box"
-        known, power = _box_table(path, hubble, band) if boxed else read_power_table(path)
-        return 1e-6 / hubble**3 * np.exp(np.interp(np.log(k / hubble), np.log(known), np.log(power)))
-    index = settings.index if settings.spectrum == "power-law" else 0.0
-    return settings.amplitude * (k / settings.pivot_k) ** index
-
-
-def _box_table(path: Path, hubble: float, band: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return k and P(k) of a box as a table has them."""
-    if band is None:
+    if settings.path is None:
+        return settings.amplitude * (k / settings.pivot_k) ** settings.index
+    if settings.spectrum == "table":
+        known, power = read_power_table(settings.path)
+    elif band is None:
         raise ValueError("band: is needed for the power spectrum of a box")
-    k, power = box_power(path, band)
-    return k / hubble, power * hubble**3
+    else:
+        known, power = box_power(settings.path, band)
+        known, power = known / hubble, power * hubble**3
+    return 1e-6 / hubble**3 * np.exp(np.interp(np.log(k / hubble), np.log(known), np.log(power)))
 
 
 def read_power_table(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -24,13 +24,15 @@ from calstudy.base.user_code import load_function, user_code
 from calstudy.sky import settings as section
 from calstudy.sky.catalogue import (
     GLEAM_SOURCES,
-    Catalogue,
     brightest,
-    concatenate,
-    gleam_path,
+    make_catalogue,
+    make_points,
+    make_power_law,
+    power_law,
     read_csv_catalogue,
     read_gleam_table,
     to_sky_model,
+    unpolarized,
     verify_gleam,
     with_errors,
 )
@@ -95,35 +97,18 @@ def make_diffuse(settings: section.HaslamMap | section.SyntheticDiffuse) -> SkyM
     S ∝ ν^(β + 2). Errors are those of `brightness_temperature`.
     """
     temperature = brightness_temperature(settings)
-    frequency = reference_frequency(settings)
+    frequency = HASLAM_FREQUENCY if isinstance(settings, section.HaslamMap) else settings.frequency
     solid_angle = healpy.nside2pixarea(settings.nside)
     per_kelvin = 2 * constants.k_B * units.K * (frequency * units.Hz / constants.c) ** 2 * solid_angle
     longitude, latitude = healpy.pix2ang(settings.nside, np.arange(temperature.size), lonlat=True)
-    stokes = np.zeros((4, 1, temperature.size))
-    stokes[0, 0] = temperature * per_kelvin.to_value("Jy")
-    return SkyModel(
-        name=np.char.add("pixel", np.arange(temperature.size).astype(str)),
-        skycoord=SkyCoord(longitude, latitude, unit="deg", frame="icrs"),
-        stokes=stokes * units.Jy,
-        spectral_type="spectral_index",
-        spectral_index=np.full(temperature.size, settings.spectral_index + 2.0),
-        reference_frequency=np.full(temperature.size, frequency) * units.Hz,
-        component_type="point",
-        history="calstudy diffuse emission",
-        # A Gaussian field may be below zero somewhere.
-        run_check_acceptability=False,
+    # A Gaussian field may be below zero somewhere.
+    return make_points(
+        np.char.add("pixel", np.arange(temperature.size).astype(str)),
+        SkyCoord(longitude, latitude, unit="deg", frame="icrs"),
+        unpolarized(temperature * per_kelvin.to_value("Jy")),
+        power_law(np.full(temperature.size, settings.spectral_index + 2.0), frequency),
+        may_be_negative=True,
     )
-
-
-def reference_frequency(settings: section.HaslamMap | section.SyntheticDiffuse) -> float:
-    """Return the frequency of the map, Hz."""
-    return HASLAM_FREQUENCY if isinstance(settings, section.HaslamMap) else settings.frequency
-
-
-def describe(settings: section.HaslamMap | section.SyntheticDiffuse) -> str:
-    """Describe the map in one phrase."""
-    name = "the Haslam map" if isinstance(settings, section.HaslamMap) else "a synthetic map"
-    return f"diffuse emission: {name} at nside {settings.nside}, T proportional to nu^{settings.spectral_index:g}"
 
 
 def add_skies(points: SkyModel, diffuse: SkyModel, frequencies: np.ndarray) -> SkyModel:
@@ -131,37 +116,25 @@ def add_skies(points: SkyModel, diffuse: SkyModel, frequencies: np.ndarray) -> S
 
     The spectra are power laws if those of the catalogue are flat or power laws, or else given at channels in Hz.
     """
-    if points.spectral_type in ("flat", "spectral_index"):
+    skies = points.copy(), diffuse
+    make_power_law(skies[0])
+    if skies[0].spectral_type == "spectral_index":
         spectra = {
-            "spectral_type": "spectral_index",
-            "spectral_index": np.concatenate([_spectral_index(points), diffuse.spectral_index]),
-            "reference_frequency": np.concatenate([_reference_frequency(points), diffuse.reference_frequency]),
+            name: np.concatenate([getattr(sky, name) for sky in skies])
+            for name in ("spectral_index", "reference_frequency")
         }
     else:
-        points, diffuse = (at_frequencies(sky, frequencies) for sky in (points, diffuse))
-        spectra = {"spectral_type": "full", "freq_array": frequencies * units.Hz}
-    directions = [sky.skycoord.icrs for sky in (points, diffuse)]
+        skies = at_frequencies(points, frequencies), at_frequencies(diffuse, frequencies)
+        spectra = {"freq_array": frequencies * units.Hz}
+    directions = [sky.skycoord.icrs for sky in skies]
     longitude, latitude = (np.concatenate([getattr(one, axis).rad for one in directions]) for axis in ("ra", "dec"))
-    return SkyModel(
-        name=np.concatenate([np.asarray(sky.name).astype(str) for sky in (points, diffuse)]),
-        skycoord=SkyCoord(longitude, latitude, unit="rad", frame="icrs"),
-        stokes=np.concatenate([sky.stokes.to("Jy") for sky in (points, diffuse)], axis=2),
-        component_type="point",
-        history="calstudy foregrounds",
-        run_check_acceptability=False,
-        **spectra,
+    return make_points(
+        np.concatenate([np.asarray(sky.name).astype(str) for sky in skies]),
+        SkyCoord(longitude, latitude, unit="rad", frame="icrs"),
+        np.concatenate([sky.stokes.to("Jy") for sky in skies], axis=2),
+        {"spectral_type": skies[0].spectral_type, **spectra},
+        may_be_negative=True,
     )
-
-
-def _spectral_index(points: SkyModel) -> np.ndarray:
-    return np.zeros(points.Ncomponents) if points.spectral_type == "flat" else points.spectral_index
-
-
-def _reference_frequency(points: SkyModel) -> units.Quantity:
-    """Return the reference frequencies of a catalogue; those of flat spectra are arbitrary."""
-    if points.reference_frequency is None:
-        return np.full(points.Ncomponents, HASLAM_FREQUENCY) * units.Hz
-    return points.reference_frequency
 
 
 LOG = logging.getLogger(__name__)
@@ -176,7 +149,9 @@ COMPLETE_DECLINATION = np.deg2rad(30.0)
 COMPLETE_LATITUDE = np.deg2rad(10.0)
 BRIGHTEST_NOW = BRIGHTEST * (FREQUENCY / COUNTS_FREQUENCY) ** SPECTRAL_INDEX
 FREQUENCY_TOLERANCE = 1.0
-NOTHING = Catalogue(np.array(["none"]), np.zeros(1), np.array([-np.pi / 2]), np.zeros(1), np.array([SPECTRAL_INDEX]))
+NOTHING = make_catalogue(
+    np.array(["none"]), np.zeros(1), np.array([-np.pi / 2]), np.zeros(1), np.array([SPECTRAL_INDEX])
+)
 
 
 @dataclass(frozen=True)
@@ -197,13 +172,16 @@ def make_foregrounds(
 
     Raises InputError if a catalogue or a map is missing or cannot be used.
     """
+    frequencies = np.asarray(frequencies, dtype=float)
     points = _points(settings, frequencies)
     if diffuse is None or isinstance(diffuse, section.NoDiffuse):
         return points
-    sky, stand_in = make_diffuse(diffuse), describe(diffuse)
+    name = "the Haslam map" if isinstance(diffuse, section.HaslamMap) else "a synthetic map"
+    sky = make_diffuse(diffuse)
+    stand_in = f"diffuse emission: {name} at nside {diffuse.nside}, T proportional to nu^{diffuse.spectral_index:g}"
     if isinstance(settings, section.NoSources):
         return Foregrounds(sky, stand_in)
-    both = add_skies(points.sky, sky, np.asarray(frequencies, float))
+    both = add_skies(points.sky, sky, frequencies)
     return Foregrounds(both, f"{points.stand_in}; {stand_in}" if points.stand_in else stand_in)
 
 
@@ -222,25 +200,20 @@ def _make(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds
     if isinstance(settings, section.GleamSources):
         return _gleam(settings)
     if isinstance(settings, section.FileSources):
-        return _from_file(settings, np.asarray(frequencies, dtype=float))
+        return _from_file(settings, frequencies)
     if isinstance(settings, section.CodeSources):
-        return _from_code(settings, np.asarray(frequencies, dtype=float))
+        return _from_code(settings, frequencies)
     return _synthetic(settings)
 
 
 def _gleam(settings: section.GleamSources) -> Foregrounds:
-    path = gleam_path() if settings.path is None else settings.path
-    if not path.is_file():
-        raise InputError(
-            f"sky.foregrounds: the GLEAM catalogue is not at {path}: download it with `calstudy data fetch gleam`, "
-            "set its path, or use kind: g4jy-and-counts"
-        )
+    path = section.find_gleam() if settings.path is None else settings.path
     verify_gleam(path)
     catalogue = read_gleam_table(path)
     stand_in = None
     if len(catalogue) < GLEAM_SOURCES:
         stand_in = f"foregrounds: {len(catalogue)} of GLEAM's {GLEAM_SOURCES} sources, from {path.name}"
-    return Foregrounds(to_sky_model(catalogue.select(brightest(catalogue.flux, settings)), settings), stand_in)
+    return Foregrounds(to_sky_model(catalogue[brightest(catalogue.flux, settings)], settings), stand_in)
 
 
 def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
@@ -260,31 +233,31 @@ def _synthetic(settings: section.SyntheticSources) -> Foregrounds:
         "counts of Franzen et al. (2019); GLEAM was not used"
     )
     LOG.info("%s", stand_in)
-    return Foregrounds(to_sky_model(both.select(chosen), settings), stand_in)
+    return Foregrounds(to_sky_model(both[chosen], settings), stand_in)
 
 
 # Every chunk of a simulation needs them, and making them takes longer than a small chunk.
 @lru_cache(maxsize=1)
-def _components(faintest: float, seed: int, index_scatter: float) -> tuple[Catalogue, int]:
+def _components(faintest: float, seed: int, index_scatter: float) -> tuple[np.recarray, int]:
     """Return G4Jy components followed by synthetic sources, down to a flux in Jy, and the number of G4Jy components."""
     real = read_gleam_table(G4JY.find())
     synthetic = _population(faintest, seed, index_scatter)
     covered = _in_g4jy_area(synthetic)
-    synthetic = synthetic.select(~covered | (synthetic.flux < COMPLETE_FLUX))
+    synthetic = synthetic[~covered | (synthetic.flux < COMPLETE_FLUX)]
     covered = np.flatnonzero(_in_g4jy_area(synthetic))
     replaced = covered[_nearest(synthetic.flux[covered], real.flux[real.flux < COMPLETE_FLUX])]
-    synthetic = synthetic.select(np.setdiff1d(np.arange(len(synthetic)), replaced))
-    return concatenate(real, synthetic), len(real)
+    both = np.concatenate([real, np.delete(synthetic, replaced)]).view(np.recarray)
+    return both, len(real)
 
 
-def _population(faintest: float, seed: int, index_scatter: float) -> Catalogue:
+def _population(faintest: float, seed: int, index_scatter: float) -> np.recarray:
     right_ascension, declination, flux = draw_population(faintest, BRIGHTEST_NOW, seed)
     order = np.argsort(-flux, kind="stable")
     names = np.char.add("synthetic", np.arange(len(flux)).astype(str))
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(INDEX_STREAM,)))
     # Brightest first, so that the index of a source does not depend on the flux limit.
     index = SPECTRAL_INDEX + index_scatter * generator.standard_normal(len(flux))
-    return Catalogue(names, right_ascension[order], declination[order], flux[order], index)
+    return make_catalogue(names, right_ascension[order], declination[order], flux[order], index)
 
 
 def in_complete_area(directions: SkyCoord) -> np.ndarray:
@@ -293,7 +266,7 @@ def in_complete_area(directions: SkyCoord) -> np.ndarray:
     return (directions.icrs.dec.rad < COMPLETE_DECLINATION) & (latitude >= COMPLETE_LATITUDE)
 
 
-def _in_g4jy_area(catalogue: Catalogue) -> np.ndarray:
+def _in_g4jy_area(catalogue: np.recarray) -> np.ndarray:
     return in_complete_area(SkyCoord(catalogue.right_ascension, catalogue.declination, unit="rad", frame="icrs"))
 
 
@@ -328,19 +301,9 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
     flux = np.where(np.isfinite(flux), flux, -np.inf)
     if flat:
         # All channels have the flux of the catalogue at the middle of the band.
-        sky = SkyModel(
-            name=sky.name,
-            skycoord=sky.skycoord,
-            stokes=at_centre.stokes,
-            spectral_type="flat",
-            component_type="point",
-            history="calstudy foregrounds",
-        )
-    elif sky.spectral_type == "full" and not _has_frequencies(sky, frequencies):
-        raise InputError(
-            f"sky.foregrounds.path: {settings.path} tabulates fluxes at frequencies other than the channels; use "
-            "spectrum: flat"
-        )
+        sky = make_points(sky.name, sky.skycoord, at_centre.stokes, {"spectral_type": "flat"})
+    else:
+        _require_channels(sky, frequencies, f"sky.foregrounds.path: {settings.path}", "; use spectrum: flat")
     chosen = brightest(flux, settings)
     stand_in = f"foregrounds: {len(chosen)} sources of {settings.path.name}"
     return Foregrounds(_in_order(sky, chosen), stand_in)
@@ -367,8 +330,7 @@ def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregr
     if sky != again:
         # Each piece of a simulation calls it.
         raise InputError(f"sky.foregrounds: {where} returns another sky at every call; draw it with a fixed seed")
-    if sky.spectral_type == "full" and not _has_frequencies(sky, frequencies):
-        raise InputError(f"sky.foregrounds: {where} tabulates fluxes at frequencies other than the channels")
+    _require_channels(sky, frequencies, f"sky.foregrounds: {where}")
     try:
         sky.check()
         sky = _in_jansky(sky)
@@ -384,12 +346,7 @@ def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregr
 def _in_order(sky: SkyModel, chosen: np.ndarray) -> SkyModel:
     """Return sources of a catalogue in a given order; `SkyModel.select` of all sources leaves the order as it is."""
     found = sky.copy()
-    for parameter in found:
-        values = getattr(found, parameter)
-        if isinstance(values.form, tuple) and "Ncomponents" in values.form and values.value is not None:
-            # The last axis; names and positions have no other.
-            setattr(found, values.name, values.value[..., chosen])
-    found.Ncomponents = len(chosen)
+    found._select_along_param_axis({"Ncomponents": chosen})
     return found
 
 
@@ -403,9 +360,12 @@ def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:
     return at_frequencies(sky, np.array([frequency]))
 
 
-def _has_frequencies(sky: SkyModel, frequencies: np.ndarray) -> bool:
-    tabulated = sky.freq_array.to_value("Hz")
-    return all(np.abs(tabulated - frequency).min() < FREQUENCY_TOLERANCE for frequency in frequencies)
+def _require_channels(sky: SkyModel, frequencies: np.ndarray, where: str, instead: str = "") -> None:
+    """Raise InputError if a sky is given by channel, and not at all of the frequencies in Hz."""
+    if sky.spectral_type == "full":
+        tabulated = sky.freq_array.to_value("Hz")
+        if any(np.abs(tabulated - frequency).min() >= FREQUENCY_TOLERANCE for frequency in frequencies):
+            raise InputError(f"{where} tabulates fluxes at frequencies other than the channels{instead}")
 
 
 def _in_jansky(sky: SkyModel) -> SkyModel:

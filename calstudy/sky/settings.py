@@ -53,6 +53,17 @@ class PointSources(Section):
     errors: CatalogueErrors = CatalogueErrors()
 
 
+def find_gleam() -> Path:
+    """Return the path of the downloaded GLEAM catalogue; raises InputError if there is none."""
+    path = default_directory() / GLEAM_FILE
+    if not path.is_file():
+        raise InputError(
+            f"GLEAM is not on this machine (looked for {path}); get it with 'calstudy data fetch gleam', give a file "
+            "under sky.foregrounds.path, or use 'g4jy-and-counts'"
+        )
+    return path
+
+
 class GleamSources(PointSources):
     """The GLEAM extragalactic catalogue (Hurley-Walker et al. 2017, VizieR VIII/100)."""
 
@@ -65,14 +76,10 @@ class GleamSources(PointSources):
     def _catalogue_is_there(self, info: ValidationInfo) -> GleamSources:
         if self.path is not None or folder_of_files(info) is None:
             return self
-        path = default_directory() / GLEAM_FILE
-        if not path.is_file():
-            raise fault(
-                "",
-                f"GLEAM is not on this machine (looked for {path}); get it with 'calstudy data fetch gleam', give a "
-                "file under sky.foregrounds.path, or use 'g4jy-and-counts'",
-            )
-        return self.model_copy(update={"path": path.resolve()})
+        try:
+            return self.model_copy(update={"path": find_gleam().resolve()})
+        except InputError as error:
+            raise fault("", str(error)) from None
 
 
 class SyntheticSources(PointSources):
@@ -134,12 +141,10 @@ class FileSources(PointSources):
 
     @model_validator(mode="after")
     def _tables_have_columns(self) -> FileSources:
-        suffix = self.path.suffix.lower()
-        if (suffix == ".csv") != (self.csv is not None):
-            raise fault("csv", "is required for CSV files (.csv), and not allowed for other files")
-        if (suffix in VOTABLE_SUFFIXES) != (self.votable is not None):
-            suffixes = ", ".join(VOTABLE_SUFFIXES)
-            raise fault("votable", f"is required for VOTables ({suffixes}), and not allowed for other files")
+        for field, kind, suffixes in (("csv", "CSV files", (".csv",)), ("votable", "VOTables", VOTABLE_SUFFIXES)):
+            if (self.path.suffix.lower() in suffixes) != (getattr(self, field) is not None):
+                listed = ", ".join(suffixes)
+                raise fault(field, f"is required for {kind} ({listed}), and not allowed for other files")
         return self
 
 

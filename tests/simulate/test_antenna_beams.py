@@ -20,7 +20,7 @@ from calstudy.products import corruption, simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.simulate.engines.dense import DenseEngine
-from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
+from calstudy.simulate.engines.other_packages import MatvisEngine, PyuvsimEngine
 from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.foregrounds import make_foregrounds
 
@@ -62,18 +62,6 @@ def expected(sky, beams, template):
 def test_engines_agree_with_pyuvsim(engine, sky, beams, template, expected):
     assert engine.refusal(sky, beams, template) is None
     assert relative_error(engine.simulate(sky, beams, template), expected) < 1e-10
-
-
-@needs_engines
-def test_cross_hands_of_different_beams_go_to_an_engine_that_has_them(sky, beams):
-    crossed = observe(count=6, channels=1, times=1)
-    crossed.polarization_array = np.array([-7, -8])
-    expected = PyuvsimEngine().simulate(sky, beams, crossed)
-    # The feeds are not confused: the two cross-hands differ by far more than the engines.
-    assert relative_error(expected[..., 0], expected[..., 1]) > 1e-3
-    assert relative_error(MatvisEngine().simulate(sky, beams, crossed), expected) < 1e-10
-    assert "confuses" in FftvisEngine().refusal(sky, beams, crossed)
-    assert SimulationSettings().engine.choose(sky, beams, crossed).label == "matvis"
 
 
 def test_only_the_baselines_of_other_antennas_change(sky, beams, template, expected, embedded_beam):

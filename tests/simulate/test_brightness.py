@@ -7,9 +7,10 @@ import pytest
 from astropy import units
 from astropy.coordinates import SkyCoord
 from pyradiosky import SkyModel
-from simulation_cases import healpix_sky
+from simulation_cases import healpix_sky, observe
 
-from calstudy.simulate.sources import is_polarized, stokes_i
+from calstudy.simulate.interface import refusal_of_polarization
+from calstudy.simulate.sources import stokes_i
 
 FREQUENCIES = np.array([172e6, 180e6, 195e6])
 
@@ -91,6 +92,7 @@ def test_a_missing_channel_and_a_missing_spectral_index_are_errors():
 
 def test_polarization_is_noticed():
     sky = make_sky(units.Jy, "flat", "point")
-    assert not is_polarized(sky)
+    template = observe(count=2, channels=1, times=1)
+    assert refusal_of_polarization(sky, template) is None
     sky.stokes[3, 0, 1] = -0.1 * units.Jy
-    assert is_polarized(sky)
+    assert "polarized" in refusal_of_polarization(sky, template)

@@ -27,7 +27,7 @@ HASLAM = section.HaslamMap(kind="haslam", nside=16)
 def kelvin_map(settings, frequencies) -> SkyModel:
     """Return the map as HEALPix brightness temperatures channel by channel: pyradiosky's units and geometry."""
     temperature = foregrounds.brightness_temperature(settings)
-    scale = (np.asarray(frequencies) / foregrounds.reference_frequency(settings)) ** settings.spectral_index
+    scale = (np.asarray(frequencies) / foregrounds.HASLAM_FREQUENCY) ** settings.spectral_index
     stokes = np.zeros((4, len(frequencies), temperature.size))
     stokes[0] = scale[:, None] * temperature
     return SkyModel(

@@ -124,7 +124,7 @@ def test_gleam_file_without_a_column(tmp_path):
 
 
 def test_missing_gleam_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(catalogue, "default_directory", lambda: tmp_path)
+    monkeypatch.setattr(section, "default_directory", lambda: tmp_path)
     with pytest.raises(InputError, match="calstudy data fetch gleam"):
         make_foregrounds(section.GleamSources(kind="gleam"), FREQUENCIES)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -90,15 +91,10 @@ class MutualCoupling(Effect):
     seed: int = Field(6, ge=0, description="Seed of the phases phi.")
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return moduli, delays (s) and phases (rad) of the coefficients, symmetric, (Nants, Nants), zero for itself.
-
-        Raise InputError if two antennas are at the same place.
-        """
+        """Return moduli, delays (s) and phases (rad) of the coefficients, symmetric, (Nants, Nants)."""
         separations = observation.positions[:, None] - observation.positions
         distances = np.linalg.norm(separations, axis=-1)
         others = ~np.eye(observation.n_antennas, dtype=bool)
-        if (distances[others] == 0).any():
-            raise InputError("corruption.effects: mutual-coupling: two antennas are at the same place")
         modulus = np.zeros(distances.shape)
         modulus[others] = self.amplitude * (self.distance / distances[others]) ** self.falloff
         phase = np.triu(random.uniform(0, 2 * np.pi, distances.shape), 1)
@@ -111,10 +107,7 @@ class MutualCoupling(Effect):
         """
         first, second = observation.antennas.T
         count = observation.n_antennas
-        if (
-            len({frozenset(pair) for pair in observation.antennas.tolist() if len(set(pair)) == 2})
-            < count * (count - 1) // 2
-        ):
+        if len({frozenset(pair) for pair in observation.antennas[~observation.autos].tolist()}) < math.comb(count, 2):
             raise InputError("corruption.effects: mutual-coupling: needs the baselines of all pairs of antennas")
         turns = truth["delay"] * observation.frequencies[:, None, None]
         coefficients = truth["modulus"] * np.exp(1j * (truth["phase"] + 2 * np.pi * turns))

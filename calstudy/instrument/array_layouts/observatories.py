@@ -13,6 +13,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from itertools import chain
 from typing import ClassVar
 
 import numpy as np
@@ -43,19 +44,13 @@ def core_positions() -> np.ndarray:
 
     Numbers run from the south: a row of the western sectors, then the adjacent row of the eastern sector.
     """
-    column, row = np.arange(LONG_ROW), np.arange(SHORT_ROW)
-    south = [np.column_stack([column - step, np.full(LONG_ROW, step)]) for step in row]
-    north = [NORTH_CORNER + np.column_stack([column, np.full(LONG_ROW, step)]) for step in row]
-    rhombus = [EAST_CORNER + np.array([-i, i + j]) for i in row for j in row]
-    east: dict[float, list[np.ndarray]] = {}
-    for position in rhombus:
-        east.setdefault(round(position[1], 6), []).append(position)
-    eastern = [np.array(sorted(row, key=lambda position: position[0])) for _, row in sorted(east.items())]
-    western = south + north
-    rows = [western[0]]
-    for west_row, east_row in zip(western[1:], eastern, strict=True):
-        rows += [west_row, east_row]
-    return np.concatenate(rows) @ LATTICE
+    column, steps = np.arange(LONG_ROW), range(SHORT_ROW)
+    western = [np.column_stack([column - step, np.full(LONG_ROW, step)]) for step in steps]
+    western += [NORTH_CORNER + np.column_stack([column, np.full(LONG_ROW, step)]) for step in steps]
+    rhombus = EAST_CORNER + np.array([(-i, i + j) for i in steps for j in steps])
+    heights = np.round(rhombus[:, 1], 6)
+    eastern = [rhombus[heights == height][::-1] for height in np.unique(heights)]
+    return np.concatenate([western[0], *chain(*zip(western[1:], eastern, strict=True))]) @ LATTICE
 
 
 def outrigger_positions() -> np.ndarray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from abc import abstractmethod
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -11,8 +12,25 @@ from calstudy.base.units import Frequency, Length
 from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
 from calstudy.instrument.settings import Channels
 
+if TYPE_CHECKING:
+    from pyuvdata.analytic_beam import AnalyticBeam
 
-class AiryBeam(BeamModel):
+
+class _Formula(BeamModel):
+    @abstractmethod
+    def _formula(self) -> tuple[AnalyticBeam, str]:
+        """Return the beam, and what it is in a note."""
+
+    def make(self, channels: Channels) -> Beam:
+        """Return the beam, which is valid at any frequency."""
+        from calstudy.instrument.beams import ExactBeam
+
+        del channels
+        beam, what = self._formula()
+        return ExactBeam(beam, self.kind, STAND_IN.format(what=what))
+
+
+class AiryBeam(_Formula):
     """The beam of a uniformly illuminated circular aperture."""
 
     version: ClassVar[int] = 2
@@ -21,18 +39,13 @@ class AiryBeam(BeamModel):
     # No aperture is larger, and the beam of one would hardly have a source in it. So also for the width of a Gaussian.
     diameter: Length = Field(4.0, gt=0, le=1e3)
 
-    def make(self, channels: Channels) -> Beam:
-        """Return the beam, which is valid at any frequency."""
+    def _formula(self) -> tuple[AnalyticBeam, str]:
         from pyuvdata import analytic_beam
 
-        from calstudy.instrument.beams import ExactBeam
-
-        del channels
-        airy = analytic_beam.AiryBeam(diameter=self.diameter)
-        return ExactBeam(airy, self.kind, STAND_IN.format(what=f"a {self.diameter:g} m Airy disk"))
+        return analytic_beam.AiryBeam(diameter=self.diameter), f"a {self.diameter:g} m Airy disk"
 
 
-class GaussianBeam(BeamModel):
+class GaussianBeam(_Formula):
     """A Gaussian power beam whose width scales with wavelength."""
 
     version: ClassVar[int] = 2
@@ -41,13 +54,9 @@ class GaussianBeam(BeamModel):
     fwhm_deg: float = Field(22.0, ge=0.01, lt=180, description="Full width at half maximum of the power beam, degrees.")
     reference_frequency: Frequency = Field(182.0e6, ge=10e6, le=10e9, description="Where the width is `fwhm_deg`.")
 
-    def make(self, channels: Channels) -> Beam:
-        """Return the beam, which is valid at any frequency."""
+    def _formula(self) -> tuple[AnalyticBeam, str]:
         from pyuvdata import analytic_beam
 
-        from calstudy.instrument.beams import ExactBeam
-
-        del channels
         # Half power at half the FWHM. The sigma is that of the E-field: pyuvdata widens a power sigma at every copy.
         gaussian = analytic_beam.GaussianBeam(
             sigma=np.deg2rad(self.fwhm_deg) / 2 / np.sqrt(np.log(2)),
@@ -55,32 +64,26 @@ class GaussianBeam(BeamModel):
             spectral_index=-1.0,
             reference_frequency=self.reference_frequency,
         )
-        return ExactBeam(gaussian, self.kind, STAND_IN.format(what=f"a Gaussian of {self.fwhm_deg:g}° FWHM"))
+        return gaussian, f"a Gaussian of {self.fwhm_deg:g}° FWHM"
 
 
-class DipoleBeam(BeamModel):
+class DipoleBeam(_Formula):
     """A short dipole."""
 
     kind: str = "short-dipole"
 
-    def make(self, channels: Channels) -> Beam:
-        """Return the beam, which is valid at any frequency."""
+    def _formula(self) -> tuple[AnalyticBeam, str]:
         from pyuvdata.analytic_beam import ShortDipoleBeam
 
-        from calstudy.instrument.beams import ExactBeam
-
-        del channels
-        return ExactBeam(ShortDipoleBeam(), self.kind, STAND_IN.format(what="a short dipole"))
+        return ShortDipoleBeam(), "a short dipole"
 
 
-class MwaAnalyticBeam(BeamModel):
+class MwaAnalyticBeam(_Formula):
     """An ideal 4 x 4 MWA tile: array factor of short dipoles over a ground screen, pointed at zenith."""
 
     kind: str = "mwa-analytic"
 
-    def make(self, channels: Channels) -> Beam:
-        """Return the beam, which is valid at any frequency."""
-        from calstudy.instrument.beams import ExactBeam, MwaTile
+    def _formula(self) -> tuple[AnalyticBeam, str]:
+        from calstudy.instrument.beams import MwaTile
 
-        del channels
-        return ExactBeam(MwaTile(), self.kind, STAND_IN.format(what="an ideal 4 x 4 tile of short dipoles"))
+        return MwaTile(), "an ideal 4 x 4 tile of short dipoles"

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from calstudy.base.package_files import PackageFile
+from calstudy.base.package_files import BEAM, PackageFile
 from calstudy.instrument.beam_frequencies import choose_frequencies, mwa_frequencies
 from calstudy.instrument.interface import STAND_IN, Beam, BeamModel
 from calstudy.instrument.settings import Channels
@@ -45,10 +45,11 @@ class _BeamfitsBeam(_TabulatedBeam, ABC):
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band slightly wider than the channels'; it refuses frequencies outside."""
         from calstudy.instrument.beams import GriddedBeam
-        from calstudy.instrument.tabulated import beamfits
+        from calstudy.instrument.tabulated import beam_of_file
 
         path, name, what = self._file()
-        return GriddedBeam(beamfits(path, channels.band, self.interpolation), name, STAND_IN.format(what=what))
+        table = beam_of_file("beamfits", path, channels.band, self.interpolation)
+        return GriddedBeam(table, name, STAND_IN.format(what=what))
 
 
 class FileBeam(_BeamfitsBeam):
@@ -98,7 +99,7 @@ class MwaEmbeddedBeam(_TabulatedBeam):
 
     def require_usable(self, channels: Channels) -> None:
         """Check that the frequencies of the file enclose the channels, without reading the rest of it."""
-        choose_frequencies(mwa_frequencies(self.path), channels.band, self.interpolation)
+        choose_frequencies(mwa_frequencies(self.path or BEAM.find()), channels.band, self.interpolation)
 
     def make(self, channels: Channels) -> Beam:
         """Read and fit the table over a band slightly wider than the channels'; it refuses frequencies outside."""

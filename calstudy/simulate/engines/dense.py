@@ -11,7 +11,7 @@ from pydantic import Field
 from calstudy.base.errors import InputError
 from calstudy.base.resources import Cost
 from calstudy.simulate.engines.other_packages import FftvisEngine, MatvisEngine, PyuvsimEngine
-from calstudy.simulate.interface import Engine, SimulationSize
+from calstudy.simulate.interface import Engine, SimulationSize, polarization_feeds, refusal_of_polarization
 from calstudy.simulate.nodes import EXACT, SINGLE_PRECISION, Accuracy
 
 if TYPE_CHECKING:
@@ -39,16 +39,10 @@ class DenseEngine(Engine):
         """Return the reason why this engine does not support a simulation, or None if it does."""
         from calstudy.instrument.antenna_beams import split_beams
         from calstudy.simulate import patterns
-        from calstudy.simulate.patches import polarization_feeds
-        from calstudy.simulate.sources import is_polarized
 
-        if is_polarized(sky):
-            return "the dense engine does not handle a polarized sky"
-        try:
-            feeds = polarization_feeds(template)
-        except InputError as error:
-            return f"the dense engine does not handle it: {error}"
-        beams, _ = split_beams(beam, template)
+        if (reason := refusal_of_polarization(sky, template)) is not None:
+            return reason
+        beams, feeds = split_beams(beam, template)[0], polarization_feeds(template)
         reasons = (patterns.refusal(item.at(template.freq_array[:1]), feeds) for item in beams)
         return next((reason for reason in reasons if reason), None)
 

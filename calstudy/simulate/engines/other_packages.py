@@ -18,7 +18,7 @@ from pydantic import Field
 from calstudy.base.resources import Cost
 from calstudy.base.visibilities import antenna_indices, require_rectangular, use_bundled_earth_orientation
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams
-from calstudy.simulate.interface import Engine, SimulationSize
+from calstudy.simulate.interface import Engine, SimulationSize, polarization_feeds, refusal_of_polarization
 from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
@@ -30,11 +30,22 @@ if TYPE_CHECKING:
 
 # matvis splits its sources so that a block takes about this much memory (bytes).
 BLOCK_MEMORY = 500_000_000
-# Row and column of each polarization number in a matrix of feeds x and y.
-FEED_PAIRS = {-5: (0, 0), -6: (1, 1), -7: (0, 1), -8: (1, 0)}
 
 
-class MatvisEngine(Engine):
+class _FeedMatrices(Engine):
+    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
+        """Return the reason why this engine does not support a simulation, or None if it does."""
+        from calstudy.instrument.antenna_beams import split_beams
+
+        if (reason := missing_package(self.kind) or refusal_of_polarization(sky, template)) is not None:
+            return reason
+        beams, _ = split_beams(beam, template)
+        if any(list(item.at(template.freq_array[:1]).feed_array) != ["x", "y"] for item in beams):
+            return f"{self.kind} needs beams with feeds x and y"
+        return None
+
+
+class MatvisEngine(_FeedMatrices):
     """matvis on the CPU, both feeds, with beams interpolated in the same way as in pyuvsim."""
 
     kind: str = "matvis"
@@ -42,10 +53,6 @@ class MatvisEngine(Engine):
         "double",
         description="Of all arithmetic, fringe phases included: single agrees with pyuvsim to 1e-4 of the rms.",
     )
-
-    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
-        """Return the reason why this engine does not support a simulation, or None if it does."""
-        return refusal("matvis", sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
@@ -68,31 +75,13 @@ class MatvisEngine(Engine):
         if flux.min() < 0:
             # matvis takes the square root of fluxes, and those of a 21 cm sky have both signs.
             visibilities -= simulate_positive(fluxes=np.maximum(-flux, 0))
-        return select_polarizations(visibilities.transpose(1, 2, 0, 4, 3), template)
+        return select_polarizations(visibilities.transpose(1, 2, 0, 3, 4), template)
 
 
 def missing_package(engine: str) -> str | None:
     """Return a message if the package of matvis or fftvis is not installed, or None."""
     if find_spec(engine) is None:
         return f"needs the package {engine}, which is not installed: pip install 'calstudy[engines]'"
-    return None
-
-
-def refusal(engine: str, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
-    """Return the reason why matvis or fftvis does not support a simulation, or None if it does."""
-    from calstudy.instrument.antenna_beams import split_beams
-    from calstudy.simulate.sources import is_polarized
-
-    if (missing := missing_package(engine)) is not None:
-        return missing
-    if is_polarized(sky):
-        return f"the {engine} engine supports unpolarized skies only"
-    unknown = [int(number) for number in template.polarization_array if int(number) not in FEED_PAIRS]
-    if unknown:
-        return f"polarization number {unknown[0]} is not linear"
-    beams, _ = split_beams(beam, template)
-    if any(list(item.at(template.freq_array[:1]).feed_array) != ["x", "y"] for item in beams):
-        return f"{engine} needs beams with feeds x and y"
     return None
 
 
@@ -103,9 +92,8 @@ def call(
 
     Antennas without baselines are left out, and the others are numbered from 0 in the telescope's order.
 
-    Both libraries sum conj(J_ai) J_bj and call it the visibility of feeds j, i. That is correct only if antennas a and
-    b have the same beam. With conjugated beams the sum is the visibility of feeds i, j for any beams, so the two feed
-    axes of the result must be exchanged.
+    Both libraries sum conj(J_ai) J_bi, which is correct only if antennas a and b have the same beam; with conjugated
+    beams the sum is the visibility for any beams.
     """
     from astropy.coordinates import ICRS
     from astropy.time import Time
@@ -133,9 +121,9 @@ def call(
 
 
 def select_polarizations(matrices: np.ndarray, template: UVData) -> np.ndarray:
-    """Return the template's polarizations, (..., Npols) complex128, from feed matrices, (..., 2, 2)."""
-    rows, columns = np.array([FEED_PAIRS[int(number)] for number in template.polarization_array]).T
-    return matrices[..., rows, columns].astype(np.complex128)
+    """Return the template's polarizations, xx or yy, (..., Npols) complex128, from feed matrices, (..., 2, 2)."""
+    feeds = ["xy".index(feed) for feed in polarization_feeds(template)]
+    return matrices[..., feeds, feeds].astype(np.complex128)
 
 
 def _as_splines(beam: UVBeam | BeamInterface) -> UVBeam | BeamInterface:
@@ -170,11 +158,9 @@ def _conjugated(beam: UVBeam | AnalyticBeam) -> UVBeam | BeamInterface:
 
 # fftvis treats an array flatter than this (m) as flat: at 200 MHz, a phase of 4e-12.
 FLATNESS = 1e-12
-# The polarization numbers of xy and yx are below that of yy.
-CROSS_HANDS = -6
 
 
-class FftvisEngine(Engine):
+class FftvisEngine(_FeedMatrices):
     """fftvis with both feeds, and beams interpolated in the same way as in pyuvsim."""
 
     kind: str = "fftvis"
@@ -183,12 +169,6 @@ class FftvisEngine(Engine):
         # fftvis' own single precision rounds frequencies to 16 Hz, 4e-5 rad for a 176 m baseline.
         description="Accuracy of the transforms, 1e-12 or 1e-6; the arithmetic is double in both.",
     )
-
-    def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
-        """Return the reason why this engine does not support a simulation, or None if it does."""
-        if isinstance(beam, AntennaBeams) and (template.polarization_array < CROSS_HANDS).any():
-            return "fftvis confuses the feeds of cross-hand polarizations if antennas have different beams"
-        return refusal("fftvis", sky, beam, template)
 
     def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
@@ -212,7 +192,7 @@ class FftvisEngine(Engine):
             coord_method="CoordinateRotationAstropy",
         )
         # Shape (Nfreqs, Ntimes, feed, feed, Nbls).
-        return select_polarizations(visibilities.transpose(1, 4, 0, 3, 2), template)
+        return select_polarizations(visibilities.transpose(1, 4, 0, 2, 3), template)
 
     def cost(self, size: SimulationSize) -> Cost:
         """Estimate the cost of a simulation; see `Engine.cost`."""
@@ -265,7 +245,9 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
 
     use_bundled_earth_orientation()
     by_antenna = dict(zip(template.telescope.antenna_names, index.tolist(), strict=True))
-    template = _by_number(template)
+    # In the order of their numbers, as pyuvsim looks antennas up.
+    template = template.copy()
+    template.telescope._select_along_param_axis({"Nants": np.argsort(template.telescope.antenna_numbers)})
     listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
     tasks = range(template.Nblts * template.Nfreqs)
     cube = np.empty((template.Nblts, template.Nfreqs, len(_products(beams[0]))), dtype=np.complex128)
@@ -277,18 +259,6 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
             engine.set_task(task)
             cube[tuple(task.uvdata_index[:2])] = engine.make_visibility()
     return cube
-
-
-def _by_number(template: UVData) -> UVData:
-    """Return metadata with the antennas of the telescope in the order of their numbers, as pyuvsim looks them up."""
-    found = template.copy()
-    telescope = found.telescope
-    order = np.argsort(telescope.antenna_numbers)
-    for parameter in telescope:
-        values = getattr(telescope, parameter)
-        if isinstance(values.form, tuple) and values.form[:1] == ("Nants",) and values.value is not None:
-            setattr(telescope, values.name, np.asarray(values.value)[order])
-    return found
 
 
 def _products(beam: UVBeam | AnalyticBeam) -> list[int]:
