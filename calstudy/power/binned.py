@@ -38,6 +38,7 @@ from calstudy.power.spectra import (
     bins_of_k,
     length_bins,
     signal_correlation,
+    sum_in_bins,
 )
 
 
@@ -65,15 +66,14 @@ def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.
     `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out. `noise`, (Nu,), is P_N of a single product
     of each unit, whose real part has the variance P_N^2 / 2.
     """
+    filled = np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan)
     level = np.max(noise, initial=0.0, where=np.isfinite(noise))
     if (noise == 0).all():
-        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 0.0, np.nan)
+        return 0 * filled
     with np.errstate(divide="ignore"):
         # Units without noise count as of so little that it does not matter.
         independent = spectra.n_pairs / (np.maximum(noise, 1e-12 * level) ** 2 / 2)
-        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan) / np.sqrt(
-            _modes_of_noise(spectra, bins, n_bins, independent)
-        )
+        return filled / np.sqrt(_modes_of_noise(spectra, bins, n_bins, independent))
 
 
 def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
@@ -142,8 +142,7 @@ def _effective_modes(
         both = 1.0 if lag == 0 else 2.0
         values = np.broadcast_to((both * between_delays[lag] * between_units)[:, None], shared.shape)[shared]
         variance += np.bincount(bins[first][shared], values, minlength=n_bins)
-    used = bins >= 0
-    total = np.bincount(bins[used], np.broadcast_to(weights[:, None], bins.shape)[used], minlength=n_bins)
+    total = sum_in_bins(weights[:, None], bins, n_bins)
     return np.divide(total**2, variance, out=np.zeros(n_bins), where=variance > 0)
 
 
@@ -171,18 +170,15 @@ def spherical_average(
     edges = make_bin_edges(settings.bins)
     n_bins = edges.size - 1
     bins = modes_in_bins(spectra, settings, exclude_wedge, only_wedge)
-    used = bins >= 0
-    weights = np.broadcast_to(spectra.n_pairs[:, None], bins.shape)[used]
-    total = np.bincount(bins[used], weights, minlength=n_bins)
-    values = weights * spectra.power[used]
-    summed = np.bincount(bins[used], values.real, minlength=n_bins).astype(complex)
-    summed += 1j * np.bincount(bins[used], values.imag, minlength=n_bins)
+    pairs = spectra.n_pairs[:, None]
+    total = sum_in_bins(pairs, bins, n_bins)
+    real, imaginary = (sum_in_bins(pairs * part, bins, n_bins) for part in (spectra.power.real, spectra.power.imag))
     unknown = np.full(n_bins, np.nan)
     return SphericalSpectrum(
         k=(edges[1:] + edges[:-1]) / 2,
         bin_edges=edges,
-        power=np.divide(summed, total, out=np.full(n_bins, np.nan, dtype=complex), where=total > 0),
-        n_modes=np.bincount(bins[used], minlength=n_bins),
+        power=np.divide(real + 1j * imaginary, total, out=np.full(n_bins, np.nan, dtype=complex), where=total > 0),
+        n_modes=np.bincount(bins[bins >= 0], minlength=n_bins),
         noise_modes=noise_modes(spectra, bins, n_bins),
         sample_modes=sample_modes(spectra, bins, n_bins),
         cross_modes=cross_modes(spectra, bins, n_bins),
@@ -192,8 +188,11 @@ def spherical_average(
     )
 
 
-def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: bool = True) -> CylindricalSpectrum:
-    """Average over baselines of similar length with equal weights for all pairs; `folded` averages +-tau as well."""
+def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings) -> CylindricalSpectrum:
+    """Average over baselines of similar length and over +-tau, with equal weights for all pairs.
+
+    Zero, and the extreme delay of an even number of channels, have no partner.
+    """
     edges, index = length_bins(spectra.length, settings.length_bin)
     power = np.zeros((len(edges), spectra.delay.size), dtype=complex)
     np.add.at(power, index, spectra.n_pairs[:, None] * spectra.power)
@@ -201,29 +200,18 @@ def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: 
     np.add.at(n_pairs, index, spectra.n_pairs)
     length = np.bincount(index, spectra.n_pairs * spectra.length) / n_pairs
     power /= n_pairs[:, None]
-    delay, k_parallel = spectra.delay, spectra.k_parallel
-    if folded:
-        delay, k_parallel, power = _fold(delay, k_parallel, power)
+    delay = spectra.delay
+    step = np.abs(np.rint(delay / (delay[1] - delay[0])).astype(int))
+    counts = np.bincount(step)
+    folded = np.zeros((counts.size, len(power)), dtype=complex)
+    np.add.at(folded, step, power.T)
     return CylindricalSpectrum(
         baseline_length=length,
         bin_edges=edges,
         k_perp=np.bincount(index, spectra.n_pairs * spectra.k_perp) / n_pairs,
-        delay=delay,
-        k_parallel=k_parallel,
-        power=power,
+        delay=np.bincount(step, np.abs(delay)) / counts,
+        k_parallel=np.bincount(step, np.abs(spectra.k_parallel)) / counts,
+        power=(folded / counts[:, None]).T,
         n_pairs=n_pairs,
         horizon_delay=horizon_delay(length),
-    )
-
-
-def _fold(delay: np.ndarray, k_parallel: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average over +-tau; zero, and the extreme delay of an even number of channels, have no partner."""
-    step = np.abs(np.rint(delay / (delay[1] - delay[0])).astype(int))
-    counts = np.bincount(step)
-    total = np.zeros((step.max() + 1, len(power)), dtype=complex)
-    np.add.at(total, step, power.T)
-    return (
-        np.bincount(step, np.abs(delay)) / counts,
-        np.bincount(step, np.abs(k_parallel)) / counts,
-        (total / counts[:, None]).T,
     )

@@ -26,7 +26,6 @@ from calstudy.base.constants import BOLTZMANN, SPEED_OF_LIGHT
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
-from calstudy.power.settings import HERA_PSPEC_ANTENNAS
 
 if TYPE_CHECKING:
     from hera_pspec.conversions import Cosmo_Conversions
@@ -198,15 +197,9 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
 
     Either each baseline with itself (ab = cd), or each with every *other* one of its redundant group, in both orders
     (ab != cd), reversed if necessary to match the group. With ``pairs="auto"`` groups are used if at least half of the
-    baselines have a redundant partner. Raise ValueError if groups are requested and no two baselines are redundant, or
-    if an antenna number is too large for hera_pspec.
+    baselines have a redundant partner. Raise ValueError if groups are requested and no two baselines are redundant.
     """
     baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
-    if antenna_pairs(uvd).max() > HERA_PSPEC_ANTENNAS:
-        raise ValueError(
-            f"antenna number {antenna_pairs(uvd).max()} is too large for hera_pspec, allowed: 0 to "
-            f"{HERA_PSPEC_ANTENNAS}"
-        )
     same = Pairs(baselines, baselines, redundant=False)
     if settings.pairs == "same-baseline":
         return same
@@ -235,13 +228,11 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
 
     A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2 for the `pol_convention` "avg" of
     pyuvdata, and half of that, V_xx = 1/2 int A I, for "sum" or None. `frequencies` are in Hz, `omega_p` is the solid
-    angle of the power beam in sr, (Nfreqs,) each. Raise ValueError for another convention.
+    angle of the power beam in sr, (Nfreqs,) each.
     """
-    halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
-    if pol_convention not in halves:
-        raise ValueError(f"pol_convention {pol_convention!r} is unknown, allowed: None, 'sum', 'avg'")
+    halves = 1.0 if pol_convention == "avg" else 2.0
     wavelength = SPEED_OF_LIGHT / frequencies
-    return halves[pol_convention] * 1e-26 * wavelength**2 / (2 * BOLTZMANN * omega_p)
+    return halves * 1e-26 * wavelength**2 / (2 * BOLTZMANN * omega_p)
 
 
 SAME_CHANNEL = 0.01

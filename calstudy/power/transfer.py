@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, skies
+from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, skies, sum_in_bins
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -158,6 +158,10 @@ class TransferFunction:
     flux_scale: float = field(metadata={"unit": ""})
 
 
+RATIOS = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence")
+"""Fields of a transfer function that have an error."""
+
+
 @dataclass(frozen=True)
 class TransferMap:
     """T and C in Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
@@ -192,23 +196,14 @@ class Injection:
     response: DelaySpectra
     cross: DelaySpectra
 
-    def __post_init__(self) -> None:
-        for name in ("response", "cross"):
-            if getattr(self, name).power.shape != self.signal.power.shape:
-                raise ValueError(
-                    f"the {name} has {getattr(self, name).power.shape} units and delays, expected those of the signal, "
-                    f"{self.signal.power.shape}"
-                )
-
 
 def where_measured(found: TransferFunction) -> TransferFunction:
     """Return a transfer function in which bins whose T is not measured hold NaN, but for the signal."""
-    names = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence")
     unknown = np.array(
         [not is_measured(*pair) for pair in zip(found.transfer, found.transfer_error, strict=True)], bool
     )
     changes: dict[str, Any] = {
-        name: np.where(unknown, np.nan, getattr(found, name)) for stem in names for name in (stem, f"{stem}_error")
+        name: np.where(unknown, np.nan, getattr(found, name)) for stem in RATIOS for name in (stem, f"{stem}_error")
     }
     return replace(found, **changes)
 
@@ -347,7 +342,7 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
         raise ValueError("the transfer functions have different bins, expected the same")
     signal = np.stack([item.signal for item in transfers])
     found: dict[str, np.ndarray] = {}
-    for name in ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence"):
+    for name in RATIOS:
         values, errors = (np.stack([getattr(item, key) for item in transfers]) for key in (name, f"{name}_error"))
         weights = np.where(np.isfinite(values), signal, 0.0)
         weights = np.divide(weights, weights.sum(axis=0), out=np.full(weights.shape, np.nan), where=weights > 0)
@@ -421,11 +416,8 @@ def bin_expected(
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)
-    bins = bins_of_k(modes, limits, buffer)
-    used = (bins >= 0) & known
-    count = np.bincount(bins[used], minlength=limits.size - 1)
-    total = np.bincount(bins[used], transfer[used], limits.size - 1)
-    square = np.bincount(bins[used], error[used] ** 2, limits.size - 1)
+    bins = np.where(known, bins_of_k(modes, limits, buffer), -1)
+    count, total, square = (sum_in_bins(values, bins, limits.size - 1) for values in (np.ones(()), transfer, error**2))
     filled = np.where(count > 0, count, np.nan)
     length_edges, row = length_bins(modes.length, length_bin)
     spacing = modes.delay[1] - modes.delay[0]
@@ -454,10 +446,9 @@ def bin_response(
     """
     limits = np.asarray(edges, float)
     bins = bins_of_k(modes, limits, buffer)
-    used = bins >= 0
     first, second = responses
     left, crossed, put_in = (
-        np.bincount(bins[used], np.real(one.conj() * other)[used], limits.size - 1)
+        sum_in_bins(np.real(one.conj() * other), bins, limits.size - 1)
         for one, other in ((first, second), (signal, (first + second) / 2), (signal, signal))
     )
     put_in = np.where(put_in > 0, put_in, np.nan)

@@ -15,10 +15,10 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.power.score import BANDS, HEADLINE_BAND, SPECTRA, CalibratedSpectra, Score, difference
 from calstudy.power.tables import load_spectrum
-from calstudy.products import spectra
+from calstudy.products.calibration import in_words
 from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, read_json
 from calstudy.products.graph import size_of
-from calstudy.products.signal_loss import statuses
+from calstudy.products.signal_loss import read_calibrated
 from calstudy.products.tolerances import COUNTS, faults, tolerance
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.standing import (
@@ -120,11 +120,7 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
 
 
 class Comparison(Task, stage="comparison", version=11):
-    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
-
-    The table has C beside T since version 9, and verdicts the linear response where it is lower since 10. Advice says
-    that no bias is seen only where none is since 11.
-    """
+    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
 
     title: str
     calibrators: Sequence[str]
@@ -180,8 +176,7 @@ class Comparison(Task, stage="comparison", version=11):
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:
-        folders = {name: self.cases[f"{case}:{name}"] for name in SPECTRA}
-        return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})
+        return read_calibrated({name: self.cases[f"{case}:{name}"] for name in SPECTRA})
 
     def _cost(self) -> Cost:
         cases = len(self.worlds) * len(self.calibrators)
@@ -212,7 +207,7 @@ def _csv_rows(
                     "gain error aligned": summary["gain_error_aligned"],
                     "gain error as fitted": summary["gain_error_as_fitted"],
                     "chi squared of held-out data": summary["held_out_chi_squared"],
-                    "solves": statuses(summary),
+                    "solves": in_words(summary["by_status"]),
                     "CPU seconds per integration": summary["cpu_seconds_per_integration"],
                     "peak memory [bytes]": summary["peak_memory"],
                 }
@@ -327,7 +322,7 @@ def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
                 _percent(summary["gain_error_aligned"]),
                 _percent(summary["gain_error_as_fitted"]),
                 _cell(summary["held_out_chi_squared"], decimals=3),
-                statuses(summary),
+                in_words(summary["by_status"]),
                 *_cost_cells(summary),
             )
         )

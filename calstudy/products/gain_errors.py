@@ -21,8 +21,8 @@ from calstudy.calibrate.gain_realizations import GainRealizations
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
-from calstudy.products import calibration, corruption, observed
-from calstudy.products.calibration import Calibrated, prepared_fit, read_result
+from calstudy.products import corruption, observed
+from calstudy.products.calibration import Calibrated, prepared_fit, read_result, solved
 from calstudy.products.files import GAINS, read_arrays, write_json
 from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
@@ -40,7 +40,7 @@ FAR_ABOVE, MODERATE, EVEN = 5.0, 20.0, 2.0
 the residual above which something else does."""
 RAN_AWAY = "the weights, from the gains, do not settle: the gains are lost in noise"
 NAMED = 6
-"""Largest number of antennas named in a warning; solution.json has all of them."""
+"""Largest number of antennas named in a warning."""
 OTHER_WEIGHTS = "take `weights: autos` if the data have autocorrelations"
 REMEDY = "solve more integrations together (integrations_per_solve), or smooth the gains (smooth_gains)"
 
@@ -65,15 +65,6 @@ class SolvedGains(NamedTuple):
 def gain_errors(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of the errors of the gains of a calibration of simulated data."""
     return ErrorsOfGains(LABEL, **solved(graph, variant, parity))
-
-
-def solved(graph: Graph, variant: Variant, parity: str) -> dict[str, Any]:
-    """Return the fields of `OfSolves` for one noise realization ("even" or "odd") of a variant."""
-    return {
-        "calibration": calibration.calibration(graph, variant, parity),
-        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
-        **calibration.calibration_inputs(graph, variant, parity),
-    }
 
 
 @memoize
@@ -155,11 +146,7 @@ class OfSolves(Calibrated):
 
 
 class ErrorsOfGains(OfSolves, stage="gain-errors", version=8):
-    """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged.
-
-    Since version 6 fits with a taper have no errors by their matrix. Since version 7 integrations without data, which
-    share gains with others, have no errors and do not count. Since version 8 realizations have the noise of each solve
-    and sample.
+    """The gains of a calibration with their errors; antennas whose gains are noise are flagged.
 
     If no solve has errors by its own matrix, they come from fits to this many `realizations` of the noise, unless it is
     zero.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,10 +86,7 @@ class ScoreTable(StudyTable):
 
 
 class MeasureScore(Task, stage="score", version=6):
-    """The scores in bins and in bands of k, and other numbers by which calibrators are compared.
-
-    Errors of gains and chi^2 are of all polarizations since version 6.
-    """
+    """The scores in bins and in bands of k, and other numbers by which calibrators are compared."""
 
     power: PowerSettings
     polarizations: int
@@ -190,14 +188,12 @@ class MeasureScore(Task, stage="score", version=6):
             for parity in PARITIES
             for record in read_json(calibrations[parity] / SOLUTION)["records"]
         ]
-        statuses = [record["status"] for record in records]
-        by_status = {status: statuses.count(status) for status in sorted(set(statuses))}
-        if set(statuses) == {"by-file"}:
-            return {"by_status": by_status, "cpu_seconds_per_integration": None, "peak_memory": None}
+        by_status = dict(sorted(Counter(record["status"] for record in records).items()))
+        known = set(by_status) != {"by-file"}
         return {
             "by_status": by_status,
-            "cpu_seconds_per_integration": cpu_seconds_per_integration(records),
-            "peak_memory": max(record["peak_memory"] for record in records),
+            "cpu_seconds_per_integration": cpu_seconds_per_integration(records) if known else None,
+            "peak_memory": max(record["peak_memory"] for record in records) if known else None,
         }
 
     def _cost(self) -> Cost:

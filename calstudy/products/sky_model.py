@@ -108,7 +108,7 @@ class SkyModelTable(StudyTable):
 
 
 class ReadSkyModel(Task, stage="sky-model", version=2):
-    """The visibilities of a file, at the samples of the data; of feeds by their directions since version 2."""
+    """The visibilities of a file, at the samples of the data, of feeds by their directions."""
 
     path: Path
     instrument: InstrumentSettings

@@ -183,8 +183,6 @@ def test_flux_conventions():
     np.testing.assert_allclose(kelvin * jansky, 1.0, rtol=1e-12)
     for convention in (None, "sum"):
         np.testing.assert_allclose(kelvin_per_jansky(frequencies, omega, convention), 2 * kelvin)
-    with pytest.raises(ValueError, match="'median' is unknown, allowed"):
-        kelvin_per_jansky(frequencies, omega, "median")
 
 
 def test_redundant_pairs_are_all_others_of_the_group_and_point_alike(observe):
@@ -310,10 +308,6 @@ def test_bad_data_are_refused(observe, white, beam):
     kelvin.vis_units = "K str"
     with pytest.raises(ValueError, match=r"odd data are in 'K str', expected 'Jy'"):
         estimate_power(even, kelvin, beam, PowerSettings())
-    numbers = even.copy()
-    numbers.ant_2_array = numbers.ant_2_array + 900
-    with pytest.raises(ValueError, match=r"antenna number 904 is too large .* 0 to 899"):
-        make_pairs(numbers, PowerSettings())
     fewer = white(observe(GOLOMB, n_channels=16), np.random.default_rng(0))
     with pytest.raises(ValueError, match="differ in freq_array"):
         estimate_power(even, fewer, beam, PowerSettings())

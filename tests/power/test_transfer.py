@@ -356,10 +356,3 @@ def test_tables_read_back(tmp_path, rng):
     assert rows[0].startswith("k [h/Mpc],k from [h/Mpc],k to [h/Mpc],transfer,transfer error")
     assert len(rows) == 3
     assert float(rows[1].split(",")[3]) == pytest.approx(0.25)
-
-
-def test_spectra_of_different_shape_are_refused(rng):
-    whole = cross(noise(rng), noise(rng))
-    part = dataclasses.replace(whole, power=whole.power[:3])
-    with pytest.raises(ValueError, match="expected those of the signal"):
-        Injection(whole, part, whole)
