@@ -52,19 +52,10 @@ def noise_level(noise: DelaySpectra) -> float:
     return float(np.sqrt(np.mean(products[:, None] * noise.power.real**2)))
 
 
-def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the number of independent products of noise in each bin, (n_bins,) float, zero for empty bins.
-
-    sigma_N falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
-    """
-    return _modes_of_noise(spectra, bins, n_bins, spectra.n_pairs)
-
-
 def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.ndarray) -> np.ndarray:
     """Return sigma_N of each bin where the units differ in their noise, (n_bins,); NaN for empty bins.
 
-    `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out. `noise`, (Nu,), is P_N of a single product
-    of each unit, whose real part has the variance P_N^2 / 2.
+    `noise`, (Nu,), is P_N of a single product of each unit, whose real part has the variance P_N^2 / 2.
     """
     filled = np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan)
     level = np.max(noise, initial=0.0, where=np.isfinite(noise))
@@ -73,26 +64,23 @@ def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.
     with np.errstate(divide="ignore"):
         # Units without noise count as of so little that it does not matter.
         independent = spectra.n_pairs / (np.maximum(noise, 1e-12 * level) ** 2 / 2)
-        return filled / np.sqrt(_modes_of_noise(spectra, bins, n_bins, independent))
+        return filled / np.sqrt(product_modes(spectra, bins, n_bins, independent))
 
 
-def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the number of independent products of signal and noise in each bin; parameters as in `noise_modes`."""
-    return _modes_of_noise(spectra, bins, n_bins, spectra.n_baselines)
+def product_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
+    """Return the effective number of products with noise in each bin, (n_bins,) float, zero for empty bins.
 
-
-def _modes_of_noise(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
-    """Return the effective modes where a unit averages `independent` samples of each polarization, (Nu,)."""
+    `independent` are the independent products of each polarization that a unit averages, (Nu,): its pairs for products
+    of noise, its baselines for those of signal and noise. Errors fall by the square root. `bins` holds the bin of each
+    mode, (Nu, Nd) int, -1 for those left out.
+    """
     units = np.arange(len(spectra.n_pairs))
     samples = independent * spectra.n_polarizations * spectra.n_times
     return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / samples))
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the number of independent modes of the signal in each bin, (n_bins,) float, zero for empty bins.
-
-    sigma_S falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
-    """
+    """Return the number of independent modes of the signal in each bin, (n_bins,); sigma_S falls by its root."""
     first, second, correlation = signal_correlation(spectra)
     return _effective_modes(spectra, bins, n_bins, (first, second, correlation)) * spectra.independent_times
 
@@ -179,9 +167,9 @@ def spherical_average(
         bin_edges=edges,
         power=np.divide(real + 1j * imaginary, total, out=np.full(n_bins, np.nan, dtype=complex), where=total > 0),
         n_modes=np.bincount(bins[bins >= 0], minlength=n_bins),
-        noise_modes=noise_modes(spectra, bins, n_bins),
+        noise_modes=product_modes(spectra, bins, n_bins, spectra.n_pairs),
         sample_modes=sample_modes(spectra, bins, n_bins),
-        cross_modes=cross_modes(spectra, bins, n_bins),
+        cross_modes=product_modes(spectra, bins, n_bins, spectra.n_baselines),
         noise_error=unknown,
         sample_error=unknown,
         wedge_excluded=exclude_wedge,

@@ -40,18 +40,11 @@ NOTE = (
     "EoR, both free of the flux scale s, outside the wedge, k in h/Mpc, one standard deviation. All numbers are in "
     "comparison.md and comparison.csv."
 )
-DIFFERENCES = ("transfer", "transfer_error", "bias", "bias_error")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One calibrator in one world.
-
-    Attributes
-    ----------
-    bins, bands : its scores in the experiment's bins of k, and in wide bands
-    summary : all of its numbers, as in score.json
-    """
+    """One calibrator in one world: scores in the experiment's bins of k and in wide bands, and all of score.json."""
 
     bins: Score
     bands: Score
@@ -172,7 +165,7 @@ class Comparison(Task, stage="comparison", version=11):
                 less = difference(pair, BANDS, self.wedge_buffer, (scales[name], scales[leader]))
                 for band, entry in enumerate(bands):
                     if entry["best"] == leader:
-                        entry |= {key: json_number(getattr(less, key)[band]) for key in DIFFERENCES}
+                        entry |= {key: json_number(values[band]) for key, values in less.items()}
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:

@@ -30,10 +30,7 @@ PATHS = "convergence.json"
 
 
 def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
-    """Return the task that follows a solver, in place of the experiment's own, on one integration of a variant.
-
-    Both realizations are solved; integrations are counted from 0.
-    """
+    """Return the task that follows a solver, in place of the experiment's own, on one integration of a variant."""
     experiment = graph.experiment
     variant = experiment.variants[name]
     noise = Variant(components=("noise",))

@@ -29,7 +29,6 @@ from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult, Solve
-    from calstudy.products.selection import Gains
 
 
 ERRORS = "gain-errors.json"
@@ -46,13 +45,7 @@ REMEDY = "solve more integrations together (integrations_per_solve), or smooth t
 
 
 class SolvedGains(NamedTuple):
-    """The gains of a solve, with their errors or the reason why there are none.
-
-    Attributes
-    ----------
-    rows, times, place : antennas, integrations and polarization in the gains of the calibration
-    gains : complex, (Nants, Nfreqs)
-    """
+    """The gains of a solve, complex, (Nants, Nfreqs), their places in all gains, and errors or why there are none."""
 
     rows: np.ndarray
     times: slice
@@ -288,19 +281,17 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=4):
         from calstudy.products.selection import read_gains
 
         result, found, reasons = read_result(self.calibration), [], []
-        true: dict[int, Gains] = {}
+        feeds = range(0 if self.gains is None else result.model.Npols)
+        true = [read_gains(self.gains, place) for place in feeds]
         for solve in self.solves(result):
             if isinstance(solve.errors, str):
                 reasons.append(solve.errors)
                 continue
             numbers = result.gains.ant_array[solve.rows]
             reference = np.ones(solve.gains.shape)
-            if self.gains is not None:
-                if solve.place not in true:
-                    true[solve.place] = read_gains(self.gains, solve.place)
-                of_feed = true[solve.place]
+            if true:
                 together = range(solve.times.start, solve.times.stop)
-                reference = np.mean([of_feed.at(time, numbers) for time in together], axis=0)
+                reference = np.mean([true[solve.place].at(time, numbers) for time in together], axis=0)
             found.append(pulls(solve.errors, solve.gains, reference))
         if not found:
             raise InputError(f"no errors of gains: {'; '.join(sorted(set(reasons)))}")

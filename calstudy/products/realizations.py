@@ -115,10 +115,7 @@ DRAWN_FOR = {"eor": "noise", "input": "eor"}
 
 @memoize
 def realization_graphs(graph: Graph) -> list[Graph]:
-    """Return the graphs of all realizations of an experiment; the first is the experiment's own.
-
-    Visibilities of the others are removed from the store after their reduction.
-    """
+    """Return the graphs of all realizations; the first is the experiment's own, and keeps its visibilities."""
     found = expand_realizations(graph.experiment)
     return [Graph(item.experiment, keep_visibilities=place == 0) for place, item in enumerate(found)]
 
@@ -176,22 +173,20 @@ class Reduced(Task, stage="realization", version=2, cost=Cost(10, disk=1e6)):
         power = self.power
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}
         residual, without, eor = SIGNAL_LOSS_VARIANTS
-        noise = dict.fromkeys((residual, without), 0.0)
+        noise = {}
         if self.noise is not None:
             level = noise_level(spectra.read_delay_spectra(self.noise))
-            noise = {name: level * spectra.excess_noise(getattr(self, name), self.noise) for name in noise}
+            noise = {
+                name: level * spectra.excess_noise(getattr(self, name), self.noise) for name in (residual, without)
+            }
         for region in REGIONS:
             means = {
                 name: spherical_average(found, power, region == "outside-wedge", region == "inside-wedge")
                 for name, found in delays.items()
             }
-            errors: dict[str, dict[str, Any]] = {
-                residual: {"noise": noise[residual], "signal": means[eor]},
-                without: {"noise": noise[without]},
-                eor: {"signal": means[eor]},
-            }
             for name, mean in means.items():
-                save_spectrum(output / spectrum_file(name, region), with_errors(mean, **errors[name]))
+                found = with_errors(mean, noise.get(name, 0.0), None if name == without else means[eor])
+                save_spectrum(output / spectrum_file(name, region), found)
         edges = make_bin_edges(power.bins)
         put_in = input_power(self.eor_settings, (edges[1:] + edges[:-1]) / 2, power.cosmology, self.band)
         factor = read_json(self.levels / LEVELS)["eor_factor"]
@@ -252,10 +247,7 @@ class RegionResults:
         return self.covered[kind][list(self.pooled.design.blocks[place][1])]
 
     def corrected_over(self, power: np.ndarray, bins: np.ndarray, known_scale: bool = False) -> Finding | None:
-        """Return the mean of P^R / T over another power, (K, Nk), in some bins; None where T is not known.
-
-        With `known_scale`, it is the mean for P^R s^2 / (T s^2).
-        """
+        """Return the mean of P^R / T, or P^R s^2 / (T s^2), over a power, (K, Nk), in some bins; None without T."""
         if self.corrected is None:
             return None
         corrected = self.corrected.power_known_scale if known_scale else self.corrected.power
@@ -362,13 +354,12 @@ def _csv_rows(
                     row[f"{name} {kind}"] = float(getattr(pooled_quantity, kind)[column])
             for kind, inside in results.covered.items():
                 row[f"covered: {kind.replace('_', ' ')}"] = _mean_of_known(inside[places, column])
-            if results.corrected is not None:
-                row["P^R / T [mK2 h-3 Mpc3]"] = _mean_of_known(results.corrected.power[places, column])
-                row["sigma from P^S [mK2 h-3 Mpc3]"] = _mean_of_known(results.corrected.error[places, column])
-                row["sigma from input [mK2 h-3 Mpc3]"] = _mean_of_known(
-                    results.corrected.error_with_sample[places, column]
-                )
-                row["why not corrected"] = str(results.corrected.reasons[column])
+            if (corrected := results.corrected) is not None:
+                powers = {"P^R / T": corrected.power, "sigma from P^S": corrected.error}
+                powers["sigma from input"] = corrected.error_with_sample
+                for name, values in powers.items():
+                    row[f"{name} [mK2 h-3 Mpc3]"] = _mean_of_known(values[places, column])
+                row["why not corrected"] = str(corrected.reasons[column])
             yield row
 
 

@@ -226,10 +226,7 @@ RUN_TIME = "run_time"
 
 @dataclass(frozen=True)
 class RunTimeTable:
-    """One run-time study: the name of the run with the machine, and its table.
-
-    The table has ``cases``, one per array and device, and ``descent``.
-    """
+    """One run-time study: the name of the run with the machine, and its table, with ``cases`` and ``descent``."""
 
     name: str
     table: Mapping[str, Any]
@@ -248,10 +245,7 @@ class RunTimeTable:
         return sorted(found, key=lambda case: case["size"])
 
     def medians(self, panel: str, kind: str, device: str = "cpu") -> np.ndarray:
-        """Return the median seconds of a kind of step or solve for each array, (Nsizes,).
-
-        The panel is "rows" or "line", the device "cpu" or "gpu".
-        """
+        """Return the median seconds of a kind of step or solve for each array of "rows" or "line", (Nsizes,)."""
         return np.array([case["seconds"][kind]["median"] for case in self.cases(panel, device)])
 
     def column(self, panel: str, name: str, device: str = "cpu") -> np.ndarray:

@@ -328,7 +328,9 @@ def test_polarizations_share_the_signal_not_the_noise():
     spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
     two = dataclasses.replace(spectra, n_polarizations=2)
     bins = np.zeros((3, 16), dtype=int)
-    np.testing.assert_allclose(binned.noise_modes(two, bins, 1), 2 * binned.noise_modes(spectra, bins, 1))
+    np.testing.assert_allclose(
+        binned.product_modes(two, bins, 1, two.n_pairs), 2 * binned.product_modes(spectra, bins, 1, spectra.n_pairs)
+    )
     np.testing.assert_allclose(binned.sample_modes(two, bins, 1), binned.sample_modes(spectra, bins, 1))
 
 
