@@ -103,10 +103,8 @@ def with_errors(
 
     `noise` is sigma_N of a single product, from `noise_level`; zero for spectra of the signal only. `signal` is the
     spectrum of the signal only in the same bins, whose real part is the sample standard deviation of one mode; None for
-    spectra of noise only. Raise ValueError if the bins differ.
+    spectra of noise only.
     """
-    if signal is not None and not np.array_equal(signal.bin_edges, spectrum.bin_edges):
-        raise ValueError("the signal's spectrum has other bins than the spectrum that needs errors, expected the same")
     amplitude = np.zeros(spectrum.k.size) if signal is None else np.abs(signal.power.real)
     with np.errstate(divide="ignore", invalid="ignore"):
         noise_error = np.where(spectrum.n_modes > 0, noise / np.sqrt(spectrum.noise_modes), np.nan)

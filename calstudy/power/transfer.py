@@ -211,13 +211,8 @@ def where_measured(found: TransferFunction) -> TransferFunction:
 def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     """Return D, the difference of two residuals of the same noise, with and without the signal in the data.
 
-    Samples that are flagged in either are flagged; the inputs are not changed. Raise ValueError if the shapes differ.
+    Samples that are flagged in either are flagged; the inputs are not changed.
     """
-    if with_signal.data_array.shape != without_signal.data_array.shape:
-        raise ValueError(
-            f"the residuals have shapes {with_signal.data_array.shape} with the signal and "
-            f"{without_signal.data_array.shape} without, expected the same"
-        )
     response = with_signal.copy()
     response.data_array = with_signal.data_array - without_signal.data_array
     response.flag_array = with_signal.flag_array | without_signal.flag_array
@@ -332,11 +327,9 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
     """Return the transfer function of several injections together, such as EoR skies of different seeds.
 
     Each enters with its signal's power, as if its modes were further modes of one injection, and errors add up as those
-    of independent skies. A number that is NaN in some of them is that of the others. Raise ValueError if there is none,
-    or if their bins differ.
+    of independent skies. A number that is NaN in some of them is that of the others. Raise ValueError if their bins
+    differ.
     """
-    if not transfers:
-        raise ValueError("no transfer function to pool, expected at least one")
     first = transfers[0]
     if any(not np.array_equal(other.bin_edges, first.bin_edges) for other in transfers):
         raise ValueError("the transfer functions have different bins, expected the same")
@@ -371,10 +364,8 @@ def correct(spectrum: SphericalSpectrum, transfer: TransferFunction, reduced: bo
     Errors of P^R and T are independent. Those of P^R are divided by T if they are `reduced` like P^R, as errors of
     what is left in measured data. Those of simulations are of all noise and EoR, of which the calibration takes as much
     as of the signal: dividing P^R by T restores both. NaN where too little is left to be corrected, or where most
-    of it is not the EoR at this k (`correctable`). Raise ValueError if the bins differ.
+    of it is not the EoR at this k (`correctable`). Bins are the same.
     """
-    if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
-        raise ValueError("spectrum and transfer function have different bins, expected the same")
     known = correctable(
         transfer.transfer, transfer.transfer_error, transfer.cross_transfer, transfer.cross_transfer_error
     )

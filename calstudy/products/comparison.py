@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -299,27 +300,28 @@ def _sky_models(found: Mapping[str, Case]) -> str:
 
 def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return the scores of one world, contents of score.json by calibrator, as a table with a row for each."""
-    bands = [band["k"] for band in next(iter(found.values()))["bands"]]
-    measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
-    cost = ("CPU s per integration", "memory")
-    headings = ("calibrator", *measured, "s", "gain error", "as fitted", "χ²", "solves", *cost)
     rows = []
     for name, summary in found.items():
-        values = [_transfer_cell(band) for band in summary["bands"]]
-        values += [_cell(band["bias"], band["bias_error"]) for band in summary["bands"]]
+        seconds, memory = _cost_cells(summary)
         rows.append(
-            (
-                name,
-                *values,
-                _cell(summary["flux_scale"], decimals=4),
-                _percent(summary["gain_error_aligned"]),
-                _percent(summary["gain_error_as_fitted"]),
-                _cell(summary["held_out_chi_squared"], decimals=3),
-                in_words(summary["by_status"]),
-                *_cost_cells(summary),
-            )
+            {
+                "calibrator": name,
+                **{_heading("transfer", band): _transfer_cell(band) for band in summary["bands"]},
+                **{_heading("bias", band): _cell(band["bias"], band["bias_error"]) for band in summary["bands"]},
+                "s": _cell(summary["flux_scale"], decimals=4),
+                "gain error": _percent(summary["gain_error_aligned"]),
+                "as fitted": _percent(summary["gain_error_as_fitted"]),
+                "χ²": _cell(summary["held_out_chi_squared"], decimals=3),
+                "solves": in_words(summary["by_status"]),
+                "CPU s per integration": seconds,
+                "memory": memory,
+            }
         )
-    return Table(headings, rows)
+    return Table.of_records(rows)
+
+
+def _heading(name: str, band: Mapping[str, Any]) -> str:
+    return f"{QUANTITIES[name]}, {band['k'][0]:g} to {band['k'][1]:g}"
 
 
 def _transfer_cell(band: Mapping[str, Any]) -> str:
@@ -337,20 +339,14 @@ def _transfer_cell(band: Mapping[str, Any]) -> str:
 
 def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
     """Return differences from the best calibrator as a table, a row for each calibrator."""
-    bands = [band["k"] for band in next(iter(less.values()))]
-    headings = [f"Δ{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
-    rows = [
-        (
-            name,
-            *(
-                "best" if band["best"] == name else _cell(band.get(key), band.get(f"{key}_error"))
-                for key in ("transfer", "bias")
-                for band in found
-            ),
-        )
-        for name, found in less.items()
-    ]
-    return Table(("calibrator", *headings), rows)
+    rows = []
+    for name, found in less.items():
+        row = {"calibrator": name}
+        for key, band in itertools.product(("transfer", "bias"), found):
+            cell = "best" if band["best"] == name else _cell(band.get(key), band.get(f"{key}_error"))
+            row[f"Δ{_heading(key, band)}"] = cell
+        rows.append(row)
+    return Table.of_records(rows)
 
 
 def _cost_cells(summary: Mapping[str, Any]) -> tuple[str, str]:

@@ -403,6 +403,10 @@ def _cell(found: Finding | None) -> str:
     return "-" if found is None or not np.isfinite(found.value) else number(found.value, found.uncertainty)
 
 
+def _mean(found: PooledRegion, name: str, bins: np.ndarray) -> str:
+    return _cell(mean_over_bins(found.values[name][:, bins], found.design))
+
+
 def _percent(found: Finding | None) -> str:
     if found is None or not np.isfinite(found.value):
         return "-"
@@ -415,11 +419,12 @@ def _rms(values: np.ndarray) -> float:
 
 def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> Table:
     """Return T, its scatter for each block of draws, and the ratio of that scatter to the quoted error."""
-    found = results.pooled
-    names = [described(block["draw"]) for block in blocks]
-    rows = []
+    found, rows = results.pooled, []
     for name, bins in _bands(found):
-        scatters = [f"{_rms(block.scatter[bins]):.4f}" for block in found.blocks["transfer"]]
+        scatters = {
+            f"scatter of T, {described(block['draw'])} drawn": f"{_rms(pooled.scatter[bins]):.4f}"
+            for block, pooled in zip(blocks, found.blocks["transfer"], strict=True)
+        }
         ratios = [
             error_ratio(*(values["transfer"][list(places)][:, bins] for values in (found.values, found.quoted)))
             for _, places in found.design.blocks
@@ -431,37 +436,29 @@ def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> 
         ratio = float(np.sqrt(counted * squares.sum()))
         error = counted * float(np.sqrt(sum((item.value * item.uncertainty) ** 2 for item in ratios)) / ratio)
         rows.append(
-            (
-                name,
-                *(_cell(mean_over_bins(found.values[key][:, bins], found.design)) for key in TRANSFER_QUANTITIES),
-                *scatters,
-                f"{_rms(total.quoted[bins]):.4f}",
-                _cell(Finding(ratio, error)),
-            )
+            {
+                "k [h/Mpc]": name,
+                **{quantity.symbol: _mean(found, key, bins) for key, quantity in TRANSFER_QUANTITIES.items()},
+                **scatters,
+                "quoted error of T": f"{_rms(total.quoted[bins]):.4f}",
+                "scatter over quoted": _cell(Finding(ratio, error)),
+            }
         )
-    symbols = [quantity.symbol for quantity in TRANSFER_QUANTITIES.values()]
-    drawn = [f"scatter of T, {name} drawn" for name in names]
-    return Table(("k [h/Mpc]", *symbols, *drawn, "quoted error of T", "scatter over quoted"), rows)
+    return Table.of_records(rows)
 
 
 def _power_table(results: RegionResults) -> Table:
     """Return P^R and P^R0 over P^S, the pulls, and the coverage of the bars of P^R."""
     found, rows = results.pooled, []
     for name, bins in _bands(found):
-        means = {key: mean_over_bins(found.values[key][:, bins], found.design) for key in QUANTITIES}
-        scatters = {key: f"{_rms(found.total[key].scatter[bins]):.2f}" for key in PULLS}
-        rows.append(
-            (
-                name,
-                *(_cell(means[key]) for key in QUANTITIES if key not in PULLS),
-                *(f"{_cell(means[key])}; {scatters[key]}" for key in PULLS),
-                _percent(results.coverage("eor", bins)),
-                _percent(results.coverage("input", bins)),
-            )
-        )
-    symbols = [quantity.symbol for key, quantity in QUANTITIES.items() if key not in PULLS]
-    pulls = [f"{QUANTITIES[key].symbol}: mean; scatter" for key in PULLS]
-    return Table(("k [h/Mpc]", *symbols, *pulls, "bars that cover P^S", "the input"), rows)
+        row = {"k [h/Mpc]": name}
+        for key, quantity in QUANTITIES.items():
+            scatter = f"; {_rms(found.total[key].scatter[bins]):.2f}" if key in PULLS else ""
+            row[quantity.symbol + (": mean; scatter" if scatter else "")] = _mean(found, key, bins) + scatter
+        row["bars that cover P^S"] = _percent(results.coverage("eor", bins))
+        row["the input"] = _percent(results.coverage("input", bins))
+        rows.append(row)
+    return Table.of_records(rows)
 
 
 def _corrected_table(results: RegionResults) -> Table:
@@ -469,24 +466,16 @@ def _corrected_table(results: RegionResults) -> Table:
     for name, bins in _bands(results.pooled):
         known = np.isfinite(results.corrected.power).all(axis=0)[bins] if results.corrected else np.zeros(0, bool)
         rows.append(
-            (
-                name,
-                _cell(results.corrected_over(results.put_in, bins)),
-                _cell(results.corrected_over(results.eor, bins)),
-                _percent(results.coverage("corrected_eor", bins)),
-                _percent(results.coverage("corrected_input", bins)),
-                f"{known.sum()} of {known.size}",
-            )
+            {
+                "k [h/Mpc]": name,
+                "P^R / T over input": _cell(results.corrected_over(results.put_in, bins)),
+                "over P^S": _cell(results.corrected_over(results.eor, bins)),
+                "intervals that cover P^S": _percent(results.coverage("corrected_eor", bins)),
+                "the input": _percent(results.coverage("corrected_input", bins)),
+                "bins corrected": f"{known.sum()} of {known.size}",
+            }
         )
-    headings = (
-        "k [h/Mpc]",
-        "P^R / T over input",
-        "over P^S",
-        "intervals that cover P^S",
-        "the input",
-        "bins corrected",
-    )
-    return Table(headings, rows)
+    return Table.of_records(rows)
 
 
 def _of_other_realizations(corrected: Corrected) -> str:

@@ -132,9 +132,8 @@ class MeasureScore(Task, stage="score", version=6):
 
     def _sky_model_error(self) -> float | None:
         """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
-        if self.sky_model_error is None:
-            return 0.0
-        return read_json(self.sky_model_error / SKY_MODEL_ERROR)["relative_error"]
+        folder = self.sky_model_error
+        return 0.0 if folder is None else read_json(folder / SKY_MODEL_ERROR)["relative_error"]
 
     def _gain_errors(self) -> dict[str, float | None]:
         """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""

@@ -334,15 +334,6 @@ def test_polarizations_share_the_signal_not_the_noise():
     np.testing.assert_allclose(binned.sample_modes(two, bins, 1), binned.sample_modes(spectra, bins, 1))
 
 
-def test_errors_need_the_same_bins():
-    spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
-    first = spherical_average(spectra, SETTINGS, False)
-    other = spherical_average(spectra, PowerSettings(), False)
-    assert np.isnan(first.error).all()
-    with pytest.raises(ValueError, match="other bins"):
-        binned.with_errors(first, signal=other)
-
-
 def test_noise_power_from_visibilities_has_its_known_level(observe, white, beam):
     """sigma_N = P_N / sqrt(2) with P_N from the standard deviation of the visibilities, groups or not."""
     template = observe(HexLayout(kind="hex", side=3), n_channels=32)
