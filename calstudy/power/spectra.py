@@ -186,16 +186,14 @@ def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: Power
 
 
 @dataclass(frozen=True)
-class CylindricalSpectrum:
-    """A power spectrum in Nb bins of baseline length and Nd delays.
+class Cylinder:
+    """Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
 
     Attributes
     ----------
     baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
     bin_edges : lower and upper edge of each bin, (Nb, 2), m
-    delay, k_parallel : (Nd,) ascending from zero, s and h/Mpc
-    power : mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k)
-    n_pairs : pairs of baselines averaged, (Nb,) int
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc
     horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
     """
 
@@ -204,9 +202,15 @@ class CylindricalSpectrum:
     k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
     delay: np.ndarray = field(metadata={"unit": "s"})
     k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
+
+
+@dataclass(frozen=True)
+class CylindricalSpectrum(Cylinder):
+    """A power spectrum, the mean over the `n_pairs` pairs of baselines in each bin, (Nb, Nd) complex."""
+
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     n_pairs: np.ndarray = field(metadata={"unit": ""})
-    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, skies, sum_in_bins
+from calstudy.power.spectra import BaselineModes, Cylinder, bins_of_k, length_bins, skies, sum_in_bins
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -163,29 +163,13 @@ RATIOS = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherenc
 
 
 @dataclass(frozen=True)
-class TransferMap:
-    """T and C in Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
+class TransferMap(Cylinder):
+    """T and C as in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples."""
 
-    Attributes
-    ----------
-    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges : lower and upper edge of each bin, (Nb, 2), m
-    delay, k_parallel : (Nd,) ascending, s and h/Mpc
-    transfer, transfer_error, cross_transfer, cross_transfer_error
-        As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
-    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
-    """
-
-    baseline_length: np.ndarray = field(metadata={"unit": "m"})
-    bin_edges: np.ndarray = field(metadata={"unit": "m"})
-    k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
-    delay: np.ndarray = field(metadata={"unit": "s"})
-    k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
     cross_transfer: np.ndarray = field(metadata={"unit": "", "array": "coherence"})
     cross_transfer_error: np.ndarray = field(metadata={"unit": "", "array": "coherence_error"})
-    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
 
 
 @dataclass(frozen=True)
