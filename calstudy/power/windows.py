@@ -89,16 +89,10 @@ def window_matrix(
 ) -> np.ndarray:
     """Return W, (Nk, Nk), NaN in rows of bins without modes outside the wedge.
 
-    Parameters
-    ----------
-    modes : of the baselines
-    left
-        Amplitudes of what two fits, to data with independent noise, leave of the signals of each bin, complex,
-        (Ndraws, Nk, Nbls, Ndelays).
-    put_in
-        Power of the amplitudes of the signals themselves, of all bins together, mean over draws, (Nbls, Ndelays): what
-        is left is measured against it, free of the sample variance of the signals.
-    edges, buffer : as in `calstudy.power.transfer.bin_response`
+    `left` are amplitudes of what two fits, to data with independent noise, leave of the signals of each bin, complex,
+    (Ndraws, Nk, Nbls, Ndelays). They are measured against `put_in`, the power of the amplitudes of the signals
+    themselves, of all bins together, mean over draws, (Nbls, Ndelays): free of the sample variance of the signals.
+    `edges` and `buffer` are as in `calstudy.power.transfer.bin_response`.
     """
     n_bins, bins = edges.size - 1, bins_of_k(modes, edges, buffer)
     even, odd = left

@@ -63,10 +63,7 @@ class Convergence(Task, stage="convergence", version=4):
     sky_model: Input = None
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Solve, and write the power that the realizations have in common after numbers of steps.
-
-        Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
-        """
+        """Solve, and write the power outside the wedge that both have in common after numbers of steps, by baseline."""
         paths, realizations = {}, {}
         for parity in PARITIES:
             realizations[parity], paths[parity], baselines = self._solved(parity)

@@ -241,8 +241,7 @@ def lost_antennas(records: Sequence[Mapping[str, Any]]) -> list[str]:
 def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> list[str]:
     """Return a sentence if noise alone makes gains that are far above the others of their antenna; none otherwise.
 
-    Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The unevenness is the
-    largest of all solves.
+    Gains and errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error.
     """
     sizes = np.where(np.isfinite(errors), np.abs(gains), np.nan)
     known = np.isfinite(sizes).any(axis=(1, 2, 3))

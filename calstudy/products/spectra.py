@@ -157,10 +157,7 @@ class Power(Task, stage="power", version=5):
     odd: Input
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the delay spectra even x odd to delay-spectra.h5, and the files of the estimator itself.
-
-        Spectra are NaN if all data are flagged because no solve gave gains.
-        """
+        """Write the delay spectra even x odd, NaN if all data are flagged, and the files of the estimator itself."""
         from calstudy.instrument.beams import make_beam
 
         even, odd = averages = [read_visibilities(folder / AVERAGE) for folder in (self.even, self.odd)]
