@@ -38,6 +38,7 @@ from calstudy.power.spectra import (
     bins_of_k,
     length_bins,
     signal_correlation,
+    sum_in_bins,
 )
 
 
@@ -51,48 +52,35 @@ def noise_level(noise: DelaySpectra) -> float:
     return float(np.sqrt(np.mean(products[:, None] * noise.power.real**2)))
 
 
-def noise_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the number of independent products of noise in each bin, (n_bins,) float, zero for empty bins.
-
-    sigma_N falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
-    """
-    return _modes_of_noise(spectra, bins, n_bins, spectra.n_pairs)
-
-
 def noise_error(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, noise: np.ndarray) -> np.ndarray:
     """Return sigma_N of each bin where the units differ in their noise, (n_bins,); NaN for empty bins.
 
-    `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out. `noise`, (Nu,), is P_N of a single product
-    of each unit, whose real part has the variance P_N^2 / 2.
+    `noise`, (Nu,), is P_N of a single product of each unit, whose real part has the variance P_N^2 / 2.
     """
+    filled = np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan)
     level = np.max(noise, initial=0.0, where=np.isfinite(noise))
     if (noise == 0).all():
-        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 0.0, np.nan)
+        return 0 * filled
     with np.errstate(divide="ignore"):
         # Units without noise count as of so little that it does not matter.
         independent = spectra.n_pairs / (np.maximum(noise, 1e-12 * level) ** 2 / 2)
-        return np.where(np.bincount(bins[bins >= 0], minlength=n_bins) > 0, 1.0, np.nan) / np.sqrt(
-            _modes_of_noise(spectra, bins, n_bins, independent)
-        )
+        return filled / np.sqrt(product_modes(spectra, bins, n_bins, independent))
 
 
-def cross_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the number of independent products of signal and noise in each bin; parameters as in `noise_modes`."""
-    return _modes_of_noise(spectra, bins, n_bins, spectra.n_baselines)
+def product_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
+    """Return the effective number of products with noise in each bin, (n_bins,) float, zero for empty bins.
 
-
-def _modes_of_noise(spectra: DelaySpectra, bins: np.ndarray, n_bins: int, independent: np.ndarray) -> np.ndarray:
-    """Return the effective modes where a unit averages `independent` samples of each polarization, (Nu,)."""
+    `independent` are the independent products of each polarization that a unit averages, (Nu,): its pairs for products
+    of noise, its baselines for those of signal and noise. Errors fall by the square root. `bins` holds the bin of each
+    mode, (Nu, Nd) int, -1 for those left out.
+    """
     units = np.arange(len(spectra.n_pairs))
     samples = independent * spectra.n_polarizations * spectra.n_times
     return _effective_modes(spectra, bins, n_bins, (units, units, 1.0 / samples))
 
 
 def sample_modes(spectra: DelaySpectra, bins: np.ndarray, n_bins: int) -> np.ndarray:
-    """Return the number of independent modes of the signal in each bin, (n_bins,) float, zero for empty bins.
-
-    sigma_S falls by its square root. `bins` holds the bin of each mode, (Nu, Nd) int, -1 for those left out.
-    """
+    """Return the number of independent modes of the signal in each bin, (n_bins,); sigma_S falls by its root."""
     first, second, correlation = signal_correlation(spectra)
     return _effective_modes(spectra, bins, n_bins, (first, second, correlation)) * spectra.independent_times
 
@@ -115,10 +103,8 @@ def with_errors(
 
     `noise` is sigma_N of a single product, from `noise_level`; zero for spectra of the signal only. `signal` is the
     spectrum of the signal only in the same bins, whose real part is the sample standard deviation of one mode; None for
-    spectra of noise only. Raise ValueError if the bins differ.
+    spectra of noise only.
     """
-    if signal is not None and not np.array_equal(signal.bin_edges, spectrum.bin_edges):
-        raise ValueError("the signal's spectrum has other bins than the spectrum that needs errors, expected the same")
     amplitude = np.zeros(spectrum.k.size) if signal is None else np.abs(signal.power.real)
     with np.errstate(divide="ignore", invalid="ignore"):
         noise_error = np.where(spectrum.n_modes > 0, noise / np.sqrt(spectrum.noise_modes), np.nan)
@@ -142,8 +128,7 @@ def _effective_modes(
         both = 1.0 if lag == 0 else 2.0
         values = np.broadcast_to((both * between_delays[lag] * between_units)[:, None], shared.shape)[shared]
         variance += np.bincount(bins[first][shared], values, minlength=n_bins)
-    used = bins >= 0
-    total = np.bincount(bins[used], np.broadcast_to(weights[:, None], bins.shape)[used], minlength=n_bins)
+    total = sum_in_bins(weights[:, None], bins, n_bins)
     return np.divide(total**2, variance, out=np.zeros(n_bins), where=variance > 0)
 
 
@@ -171,29 +156,29 @@ def spherical_average(
     edges = make_bin_edges(settings.bins)
     n_bins = edges.size - 1
     bins = modes_in_bins(spectra, settings, exclude_wedge, only_wedge)
-    used = bins >= 0
-    weights = np.broadcast_to(spectra.n_pairs[:, None], bins.shape)[used]
-    total = np.bincount(bins[used], weights, minlength=n_bins)
-    values = weights * spectra.power[used]
-    summed = np.bincount(bins[used], values.real, minlength=n_bins).astype(complex)
-    summed += 1j * np.bincount(bins[used], values.imag, minlength=n_bins)
+    pairs = spectra.n_pairs[:, None]
+    total = sum_in_bins(pairs, bins, n_bins)
+    real, imaginary = (sum_in_bins(pairs * part, bins, n_bins) for part in (spectra.power.real, spectra.power.imag))
     unknown = np.full(n_bins, np.nan)
     return SphericalSpectrum(
         k=(edges[1:] + edges[:-1]) / 2,
         bin_edges=edges,
-        power=np.divide(summed, total, out=np.full(n_bins, np.nan, dtype=complex), where=total > 0),
-        n_modes=np.bincount(bins[used], minlength=n_bins),
-        noise_modes=noise_modes(spectra, bins, n_bins),
+        power=np.divide(real + 1j * imaginary, total, out=np.full(n_bins, np.nan, dtype=complex), where=total > 0),
+        n_modes=np.bincount(bins[bins >= 0], minlength=n_bins),
+        noise_modes=product_modes(spectra, bins, n_bins, spectra.n_pairs),
         sample_modes=sample_modes(spectra, bins, n_bins),
-        cross_modes=cross_modes(spectra, bins, n_bins),
+        cross_modes=product_modes(spectra, bins, n_bins, spectra.n_baselines),
         noise_error=unknown,
         sample_error=unknown,
         wedge_excluded=exclude_wedge,
     )
 
 
-def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: bool = True) -> CylindricalSpectrum:
-    """Average over baselines of similar length with equal weights for all pairs; `folded` averages +-tau as well."""
+def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings) -> CylindricalSpectrum:
+    """Average over baselines of similar length and over +-tau, with equal weights for all pairs.
+
+    Zero, and the extreme delay of an even number of channels, have no partner.
+    """
     edges, index = length_bins(spectra.length, settings.length_bin)
     power = np.zeros((len(edges), spectra.delay.size), dtype=complex)
     np.add.at(power, index, spectra.n_pairs[:, None] * spectra.power)
@@ -201,29 +186,18 @@ def cylindrical_average(spectra: DelaySpectra, settings: PowerSettings, folded: 
     np.add.at(n_pairs, index, spectra.n_pairs)
     length = np.bincount(index, spectra.n_pairs * spectra.length) / n_pairs
     power /= n_pairs[:, None]
-    delay, k_parallel = spectra.delay, spectra.k_parallel
-    if folded:
-        delay, k_parallel, power = _fold(delay, k_parallel, power)
+    delay = spectra.delay
+    step = np.abs(np.rint(delay / (delay[1] - delay[0])).astype(int))
+    counts = np.bincount(step)
+    folded = np.zeros((counts.size, len(power)), dtype=complex)
+    np.add.at(folded, step, power.T)
     return CylindricalSpectrum(
         baseline_length=length,
         bin_edges=edges,
         k_perp=np.bincount(index, spectra.n_pairs * spectra.k_perp) / n_pairs,
-        delay=delay,
-        k_parallel=k_parallel,
-        power=power,
+        delay=np.bincount(step, np.abs(delay)) / counts,
+        k_parallel=np.bincount(step, np.abs(spectra.k_parallel)) / counts,
+        power=(folded / counts[:, None]).T,
         n_pairs=n_pairs,
         horizon_delay=horizon_delay(length),
-    )
-
-
-def _fold(delay: np.ndarray, k_parallel: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Average over +-tau; zero, and the extreme delay of an even number of channels, have no partner."""
-    step = np.abs(np.rint(delay / (delay[1] - delay[0])).astype(int))
-    counts = np.bincount(step)
-    total = np.zeros((step.max() + 1, len(power)), dtype=complex)
-    np.add.at(total, step, power.T)
-    return (
-        np.bincount(step, np.abs(delay)) / counts,
-        np.bincount(step, np.abs(k_parallel)) / counts,
-        (total / counts[:, None]).T,
     )

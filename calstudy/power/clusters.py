@@ -33,7 +33,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calstudy.power.spectra import DelaySpectra, bins_of_k, skies
+from calstudy.power.spectra import DelaySpectra, bins_of_k, skies, sum_in_bins
 
 LARGEST_PART = 0.5
 """Upper limit of w_a: little of a bin is left without an antenna that has a larger part of its modes."""
@@ -68,12 +68,8 @@ class Clusters:
         unit = spectra.share_unit
         antenna = np.broadcast_to(spectra.share_antenna[:, None], (unit.size, bins.shape[1]))
         share_mode, (share_sample, share_antenna) = _number(mode[unit], antenna)
-        pairs, share_pairs = (
-            np.broadcast_to(count[:, None], bins[rows].shape)
-            for count, rows in ((spectra.n_pairs, slice(None)), (spectra.share_pairs, unit))
-        )
-        weight = _added(pairs, mode, owner.size)
-        share_weight = _added(share_pairs, share_mode, share_sample.size)
+        weight = sum_in_bins(spectra.n_pairs[:, None], mode, owner.size)
+        share_weight = sum_in_bins(spectra.share_pairs[:, None], share_mode, share_sample.size)
         return cls(n_bins, mode, share_mode, owner, weight, share_sample, share_antenna, share_weight)
 
     @classmethod
@@ -101,8 +97,10 @@ class Clusters:
 
         `shares` are the parts of it by the pairs that contain an antenna, (Nm, Nd).
         """
-        samples = _added(values, self.mode, self.owner.size)
-        return Sums(self, samples, _added(shares, self.share_mode, self.share_sample.size))
+        # Without shares, their power has no delays either.
+        shares = np.reshape(shares, self.share_mode.shape)
+        samples = sum_in_bins(values, self.mode, self.owner.size)
+        return Sums(self, samples, sum_in_bins(shares, self.share_mode, self.share_sample.size))
 
     def powers(self, spectra: DelaySpectra) -> Sums:
         """Add up the real parts of powers, each pair of baselines counting the same."""
@@ -177,11 +175,6 @@ def _combinations(group: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.
     count = int(label.max(initial=0)) + 1
     found, index = np.unique(group * count + label, return_inverse=True)
     return found // count, found % count, index
-
-
-def _added(values: np.ndarray, number: np.ndarray, size: int) -> np.ndarray:
-    used = number >= 0
-    return np.bincount(number[used], np.reshape(values, number.shape)[used], size)
 
 
 def clusters_in_k(spectra: DelaySpectra, edges: np.ndarray, buffer: float, inside: bool) -> Clusters:

@@ -65,12 +65,10 @@ def hera_conversions(cosmology: FLRW, z: float) -> Cosmo_Conversions:
     hera_pspec has only matter, curvature and Lambda, which makes its X^2 Y 0.1 to 0.8 % too large for Planck15 because
     radiation and massive neutrinos are missing, and stores those numbers in its files. Here the matter and Lambda terms
     are set so that both H(z) and the comoving distance equal astropy's at `z`: *effective* densities, which survive a
-    round trip through HDF5 and describe this redshift, not today. Raise ValueError if the cosmology is not flat.
+    round trip through HDF5 and describe this redshift, not today. All cosmologies of `PowerSettings` are flat.
     """
     from hera_pspec.conversions import Cosmo_Conversions
 
-    if cosmology.Ok0 != 0.0:
-        raise ValueError(f"cosmology {cosmology.name!r} is curved (Ok0 = {cosmology.Ok0}), allowed: flat cosmologies")
     dark_energy, matter = _effective_densities(cosmology, z)
     # Plain floats: hera_pspec writes their repr to HDF5 and cannot read "np.float64(...)" back.
     baryons = float(cosmology.Ob0)

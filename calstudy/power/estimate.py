@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,6 @@ from calstudy.base.constants import BOLTZMANN, SPEED_OF_LIGHT
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
-from calstudy.power.settings import HERA_PSPEC_ANTENNAS
 
 if TYPE_CHECKING:
     from hera_pspec.conversions import Cosmo_Conversions
@@ -181,33 +180,19 @@ logger = logging.getLogger(__name__)
 
 HERA_TAPERS = {"blackman-harris": "blackmanharris", "hann": "hann", "tukey": "tukey", "none": "none"}
 
-Baseline = tuple[int, int]
+Pair = tuple[tuple[int, int], tuple[int, int]]
+"""A baseline, as antenna numbers (a, b), of the even data, and one of the odd data to cross it with."""
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """Baselines to cross, as antenna numbers (a, b): ``first[i]`` of the even data with ``second[i]`` of the odd."""
-
-    first: list[Baseline]
-    second: list[Baseline]
-    redundant: bool
-
-
-def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
+def make_pairs(uvd: UVData, settings: PowerSettings) -> list[Pair]:
     """Choose the pairs of baselines of the cross spectra (paper §Reduction of Simulation Products and Power Spectra).
 
     Either each baseline with itself (ab = cd), or each with every *other* one of its redundant group, in both orders
     (ab != cd), reversed if necessary to match the group. With ``pairs="auto"`` groups are used if at least half of the
-    baselines have a redundant partner. Raise ValueError if groups are requested and no two baselines are redundant, or
-    if an antenna number is too large for hera_pspec.
+    baselines have a redundant partner. Raise ValueError if groups are requested and no two baselines are redundant.
     """
     baselines = [(int(a), int(b)) for a, b in antenna_pairs(uvd)]
-    if antenna_pairs(uvd).max() > HERA_PSPEC_ANTENNAS:
-        raise ValueError(
-            f"antenna number {antenna_pairs(uvd).max()} is too large for hera_pspec, allowed: 0 to "
-            f"{HERA_PSPEC_ANTENNAS}"
-        )
-    same = Pairs(baselines, baselines, redundant=False)
+    same = [(pair, pair) for pair in baselines]
     if settings.pairs == "same-baseline":
         return same
     groups = redundant_groups(baseline_vectors(uvd), settings.redundancy_tolerance)
@@ -224,10 +209,8 @@ def make_pairs(uvd: UVData, settings: PowerSettings) -> Pairs:
         pair[::-1] if conjugated else pair for pair, conjugated in zip(baselines, groups.conjugated, strict=True)
     ]
     order = np.argsort(groups.index, kind="stable")
-    crossed = []
-    for group in np.split(order, np.cumsum(members)[:-1]):
-        crossed += [(oriented[i], oriented[j]) for i in group for j in group if i != j]
-    return Pairs([pair[0] for pair in crossed], [pair[1] for pair in crossed], redundant=True)
+    alike = ([oriented[member] for member in group] for group in np.split(order, np.cumsum(members)[:-1]))
+    return [pair for group in alike for pair in permutations(group, 2)]
 
 
 def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_convention: str | None) -> np.ndarray:
@@ -235,13 +218,11 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
 
     A uniform sky of temperature T gives V = int A I = 2 k T Omega_p / lambda^2 for the `pol_convention` "avg" of
     pyuvdata, and half of that, V_xx = 1/2 int A I, for "sum" or None. `frequencies` are in Hz, `omega_p` is the solid
-    angle of the power beam in sr, (Nfreqs,) each. Raise ValueError for another convention.
+    angle of the power beam in sr, (Nfreqs,) each.
     """
-    halves = {None: 2.0, "sum": 2.0, "avg": 1.0}
-    if pol_convention not in halves:
-        raise ValueError(f"pol_convention {pol_convention!r} is unknown, allowed: None, 'sum', 'avg'")
+    halves = 1.0 if pol_convention == "avg" else 2.0
     wavelength = SPEED_OF_LIGHT / frequencies
-    return halves[pol_convention] * 1e-26 * wavelength**2 / (2 * BOLTZMANN * omega_p)
+    return halves * 1e-26 * wavelength**2 / (2 * BOLTZMANN * omega_p)
 
 
 SAME_CHANNEL = 0.01
@@ -274,24 +255,22 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     _require_match(even, odd)
     pairs = _unflagged(make_pairs(even, settings), even, odd)
     frequencies = even.freq_array
-    polarizations = [int(pol) for pol in even.polarization_array]
-    angles = {pol: beam.solid_angles(frequencies, utils.polnum2str(pol)) for pol in polarizations}
+    angles = {int(pol): beam.solid_angles(frequencies, utils.polnum2str(pol)) for pol in even.polarization_array}
     centre = float(redshift(frequencies.mean()))
     adapter = PSpecBeamFromArray(
-        OmegaP={pol: angles[pol][0] for pol in polarizations},
-        OmegaPP={pol: angles[pol][1] for pol in polarizations},
+        OmegaP={pol: found[0] for pol, found in angles.items()},
+        OmegaPP={pol: found[1] for pol, found in angles.items()},
         beam_freqs=frequencies,
         cosmo=_conversions(settings.cosmology, centre),
     )
     estimator = DiagonalPSpecData(
         dsets=[_to_millikelvin(uvd, angles) for uvd in (even, odd)], labels=["even", "odd"], beam=adapter
     )
-    logger.info("crossing %d pairs of baselines (redundant groups: %s)", len(pairs.first), pairs.redundant)
+    logger.info("crossing %d pairs of baselines", len(pairs))
     return estimator.pspec(
-        pairs.first,
-        pairs.second,
+        *map(list, zip(*pairs, strict=True)),
         dsets=(0, 1),
-        pols=[(pol, pol) for pol in polarizations],
+        pols=[(pol, pol) for pol in angles],
         input_data_weight="identity",
         taper=HERA_TAPERS[settings.taper],
         # A group may be wider than the tolerance between neighbours; that choice was made above.
@@ -303,21 +282,18 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     )
 
 
-def _unflagged(pairs: Pairs, even: UVData, odd: UVData) -> Pairs:
+def _unflagged(pairs: list[Pair], even: UVData, odd: UVData) -> list[Pair]:
     """Leave out pairs with a baseline that has no data in some polarization."""
-    good = [~uvd.flag_array.all(axis=1).any(axis=1) for uvd in (even, odd)]
     usable = []
-    for observed in good:
-        listed = antenna_pairs(even)[observed].tolist()
+    for uvd in (even, odd):
+        listed = antenna_pairs(even)[~uvd.flag_array.all(axis=1).any(axis=1)].tolist()
         usable.append({(a, b) for a, b in listed} | {(b, a) for a, b in listed})
-    kept = [
-        pair for pair in zip(pairs.first, pairs.second, strict=True) if pair[0] in usable[0] and pair[1] in usable[1]
-    ]
+    kept = [pair for pair in pairs if pair[0] in usable[0] and pair[1] in usable[1]]
     if not kept:
         raise ValueError("all pairs of baselines are flagged, expected at least one with data")
-    if len(kept) < len(pairs.first):
-        logger.warning("left out %d of %d pairs of baselines: flagged", len(pairs.first) - len(kept), len(pairs.first))
-    return Pairs([first for first, _ in kept], [second for _, second in kept], pairs.redundant)
+    if len(kept) < len(pairs):
+        logger.warning("left out %d of %d pairs of baselines: flagged", len(pairs) - len(kept), len(pairs))
+    return kept
 
 
 def _to_millikelvin(uvd: UVData, angles: dict[int, tuple[np.ndarray, np.ndarray]]) -> UVData:

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import clusters_in_k, linear_error
 from calstudy.power.spectra import DelaySpectra, of_common_units
+from calstudy.power.transfer import Injection
 
 BANDS = (0.1, 0.2, 0.5, 1.0)
 """Edges in h/Mpc of the bands in which calibrations are compared."""
@@ -35,16 +36,9 @@ HEADLINE_BAND = (0.2, 0.5)
 
 
 @dataclass(frozen=True)
-class CalibratedSpectra:
-    """Delay spectra of the same units and delays.
+class CalibratedSpectra(Injection):
+    """Delay spectra of an injected EoR, and of the calibrated residual of data with it and without."""
 
-    `signal` is of the EoR alone, `response` of the change of the residual by the EoR, and `cross` of the EoR times this
-    change; `residual` and `residual_without_eor` are of the calibrated residual of data with and without the EoR.
-    """
-
-    signal: DelaySpectra
-    response: DelaySpectra
-    cross: DelaySpectra
     residual: DelaySpectra
     residual_without_eor: DelaySpectra
 
@@ -81,19 +75,6 @@ class Score:
     cross_transfer: np.ndarray = field(default_factory=lambda: np.array(np.nan), metadata={"unit": ""})
 
 
-@dataclass(frozen=True)
-class Difference:
-    """How the scores of two calibrations of the same data differ in Nk bins of |k|, outside the wedge.
-
-    T s^2 of the first less that of the second, the same of s^2 P^R0 / P^S, and their standard deviations, (Nk,) each.
-    """
-
-    transfer: np.ndarray
-    transfer_error: np.ndarray
-    bias: np.ndarray
-    bias_error: np.ndarray
-
-
 def score(spectra: CalibratedSpectra, edges: ArrayLike, buffer: float, flux_scale: float) -> Score:
     """Return the scores in bins of |k| outside the wedge; `edges` and `buffer` are as in `clusters_in_k`.
 
@@ -126,11 +107,12 @@ def difference(
     edges: ArrayLike,
     buffer: float,
     flux_scales: tuple[float, float],
-) -> Difference:
+) -> dict[str, np.ndarray]:
     """Return how the scores of two calibrations of the same data differ, of the units that both have.
 
-    `edges` and `buffer` are as for `score`; `flux_scales` are s of both, NaN if not known. Raises InputError if they
-    have no unit in common.
+    ``transfer`` is T s^2 of the first less that of the second, ``bias`` the same of s^2 P^R0 / P^S, outside the wedge;
+    ``transfer_error`` and ``bias_error`` are their standard deviations, (Nk,) each. `edges` and `buffer` are as for
+    `score`; `flux_scales` are s of both, NaN if not known. Raises InputError if they have no unit in common.
     """
     limits = np.asarray(edges, dtype=float)
     common = of_common_units(
@@ -138,8 +120,8 @@ def difference(
     )
     clusters = clusters_in_k(common["signal 0"], limits, buffer, inside=False)
     sums = {name: clusters.powers(one) for name, one in common.items()}
-    found = []
-    for name in ("response", "residual_without_eor"):
+    found: dict[str, np.ndarray] = {}
+    for key, name in (("transfer", "response"), ("bias", "residual_without_eor")):
         powers, signals, values = [], [], []
         for place, factor in enumerate((flux_scales[0] ** 2, -(flux_scales[1] ** 2))):
             power, signal = sums[f"{name} {place}"], sums[f"signal {place}"]
@@ -149,5 +131,5 @@ def difference(
                 # As for a ratio, deviations are those from the mean ratio, which add up to zero.
                 signals.append((-value / signal.total, signal))
             values.append(value)
-        found += [values[0] + values[1], linear_error((*powers, *signals))]
-    return Difference(*found)
+        found |= {key: values[0] + values[1], f"{key}_error": linear_error((*powers, *signals))}
+    return found

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -87,18 +87,19 @@ class DelaySpectra:
 
     def antennas_of_units(self) -> list[tuple[int, ...]]:
         """Return the antennas of each unit, ascending: two for one baseline; none where shares are not known."""
-        members: list[set[int]] = [set() for _ in self.n_pairs]
-        for unit, antenna in zip(self.share_unit.tolist(), self.share_antenna.tolist(), strict=True):
-            members[unit].add(antenna)
-        return [tuple(sorted(found)) for found in members]
+        return [tuple(sorted(found)) for found in self._shares_of_units()]
 
     def pairs_of_units(self) -> list[tuple[object, ...]]:
         """Return a key of each unit: its vector to a mm, and the number of its pairs that contain each antenna."""
-        members: list[list[tuple[int, int]]] = [[] for _ in self.n_pairs]
-        for unit, antenna, count in zip(self.share_unit, self.share_antenna, self.share_pairs, strict=True):
-            members[unit].append((int(antenna), int(count)))
         places = np.rint(1e3 * self.vectors).astype(int).tolist()
-        return [(*place, *sorted(found)) for place, found in zip(places, members, strict=True)]
+        return [(*place, *sorted(found.items())) for place, found in zip(places, self._shares_of_units(), strict=True)]
+
+    def _shares_of_units(self) -> list[dict[int, int]]:
+        """Return the number of pairs of each unit that contain an antenna, by its number."""
+        members: list[dict[int, int]] = [{} for _ in self.n_pairs]
+        for unit, antenna, count in zip(self.share_unit, self.share_antenna, self.share_pairs, strict=True):
+            members[unit][int(antenna)] = int(count)
+        return members
 
     def of_units(self, units: np.ndarray) -> DelaySpectra:
         """Return the spectra of some units, by their numbers, ascending."""
@@ -185,16 +186,14 @@ def modes_of(delay: np.ndarray, lengths: np.ndarray, centre: float, power: Power
 
 
 @dataclass(frozen=True)
-class CylindricalSpectrum:
-    """A power spectrum in Nb bins of baseline length and Nd delays.
+class Cylinder:
+    """Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
 
     Attributes
     ----------
     baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
     bin_edges : lower and upper edge of each bin, (Nb, 2), m
-    delay, k_parallel : (Nd,) ascending, s and h/Mpc; from zero up if folded
-    power : mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k)
-    n_pairs : pairs of baselines averaged, (Nb,) int
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc
     horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
     """
 
@@ -203,9 +202,15 @@ class CylindricalSpectrum:
     k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
     delay: np.ndarray = field(metadata={"unit": "s"})
     k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
+    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
+
+
+@dataclass(frozen=True)
+class CylindricalSpectrum(Cylinder):
+    """A power spectrum, the mean over the `n_pairs` pairs of baselines in each bin, (Nb, Nd) complex."""
+
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     n_pairs: np.ndarray = field(metadata={"unit": ""})
-    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
 
 
 @dataclass(frozen=True)
@@ -273,6 +278,12 @@ def bins_of_k(
     if buffer is not None:
         bins[outside_wedge(modes, buffer) == inside] = -1
     return bins
+
+
+def sum_in_bins(values: np.ndarray, bins: np.ndarray, n_bins: int) -> np.ndarray:
+    """Return the sum of real values in each bin, (n_bins,); `bins` are int, -1 for none, and values broadcast to it."""
+    used = bins >= 0
+    return np.bincount(bins[used], np.broadcast_to(values, bins.shape)[used], n_bins)
 
 
 def length_bins(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -351,30 +362,25 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
     power = np.zeros((len(vectors), uvp.Ndlys), dtype=complex)
     np.add.at(power, unit, uvp.data_array[0].mean(axis=2))
     n_pairs = np.bincount(unit)
-    shares = _antenna_shares(uvp, pairs, unit)
-    cosmology, frequency = make_cosmology(settings.cosmology), float(uvp.freq_array.mean())
+    frequency = float(uvp.freq_array.mean())
+    modes = modes_of(uvp.dly_array, np.linalg.norm(vectors, axis=1), frequency, settings)
     return DelaySpectra(
         power=power / n_pairs[:, None],
         vectors=vectors,
         n_pairs=n_pairs,
         n_polarizations=uvp.Npols,
         delay=uvp.dly_array.copy(),
-        k_perp=k_perpendicular(cosmology, np.linalg.norm(vectors, axis=1), frequency),
-        k_parallel=k_parallel(cosmology, uvp.dly_array, frequency),
+        k_perp=modes.k_perp,
+        k_parallel=modes.k_parallel,
         frequency=frequency,
         omega_pp=float(uvp.OmegaPP.mean()),
         taper=settings.taper,
-        share_unit=shares[0],
-        share_antenna=shares[1],
-        share_pairs=shares[2],
-        share_power=shares[3],
+        **_antenna_shares(uvp, pairs, unit),
     )
 
 
-def _antenna_shares(
-    uvp: UVPSpec, pairs: np.ndarray, unit: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return unit, antenna, number of pairs and summed power (mean over polarizations) of `DelaySpectra`'s shares."""
+def _antenna_shares(uvp: UVPSpec, pairs: np.ndarray, unit: np.ndarray) -> dict[str, Any]:
+    """Return the shares of `DelaySpectra`, powers as means over polarizations."""
     numbers = {int(code): uvp.bl_to_antnums(int(code)) for code in np.unique(pairs)}
     antennas = np.array([[*numbers[first], *numbers[second]] for first, second in pairs.tolist()])
     # A pair counts once for an antenna that both of its baselines have.
@@ -384,7 +390,8 @@ def _antenna_shares(
     (owner, antenna), share = np.unique(np.stack([unit[pair], antennas[pair, column]]), axis=1, return_inverse=True)
     power = np.zeros((owner.size, uvp.Ndlys), dtype=complex)
     np.add.at(power, share, uvp.data_array[0].mean(axis=2)[pair])
-    return owner, antenna, np.bincount(share), power
+    counts = np.bincount(share)
+    return {"share_unit": owner, "share_antenna": antenna, "share_pairs": counts, "share_power": power}
 
 
 def _units(uvp: UVPSpec, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

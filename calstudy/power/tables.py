@@ -5,30 +5,19 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import h5py
 import numpy as np
 
 from calstudy.base.table import Table
-from calstudy.power.gain_bias import GainBias
-from calstudy.power.score import Score
-from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
-from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
-from calstudy.power.windows import UnbiasedSpectrum
+from calstudy.power.spectra import SphericalSpectrum
+from calstudy.power.transfer import TransferFunction
 
-Spectrum = TypeVar(
-    "Spectrum",
-    DelaySpectra,
-    SphericalSpectrum,
-    CylindricalSpectrum,
-    TransferFunction,
-    TransferMap,
-    ExpectedBins,
-    GainBias,
-    Score,
-    UnbiasedSpectrum,
-)
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Spectrum = TypeVar("Spectrum", bound="DataclassInstance")
 
 CSV_COLUMNS = {
     "k [h/Mpc]": lambda s: s.k,
@@ -60,7 +49,7 @@ TRANSFER_COLUMNS = {
 }
 
 
-def save_spectrum(path: Path, spectrum: Spectrum) -> None:
+def save_spectrum(path: Path, spectrum: DataclassInstance) -> None:
     """Write every field as an HDF5 data set of its name with the attribute ``unit``, replacing the file."""
     with h5py.File(path, "w") as file:
         file.attrs["kind"] = type(spectrum).__name__

@@ -73,7 +73,7 @@ from numpy.typing import ArrayLike
 
 from calstudy.power.clusters import Clusters, Sums, clusters_in_k, linear_error
 from calstudy.power.delay import horizon_delay
-from calstudy.power.spectra import BaselineModes, bins_of_k, length_bins, skies
+from calstudy.power.spectra import BaselineModes, Cylinder, bins_of_k, length_bins, skies, sum_in_bins
 from calstudy.verdicts.standing import is_measured
 
 if TYPE_CHECKING:
@@ -158,30 +158,18 @@ class TransferFunction:
     flux_scale: float = field(metadata={"unit": ""})
 
 
+RATIOS = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence")
+"""Fields of a transfer function that have an error."""
+
+
 @dataclass(frozen=True)
-class TransferMap:
-    """T and C in Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
+class TransferMap(Cylinder):
+    """T and C as in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples."""
 
-    Attributes
-    ----------
-    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges : lower and upper edge of each bin, (Nb, 2), m
-    delay, k_parallel : (Nd,) ascending, s and h/Mpc
-    transfer, transfer_error, cross_transfer, cross_transfer_error
-        As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
-    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
-    """
-
-    baseline_length: np.ndarray = field(metadata={"unit": "m"})
-    bin_edges: np.ndarray = field(metadata={"unit": "m"})
-    k_perp: np.ndarray = field(metadata={"unit": "h/Mpc"})
-    delay: np.ndarray = field(metadata={"unit": "s"})
-    k_parallel: np.ndarray = field(metadata={"unit": "h/Mpc"})
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
     cross_transfer: np.ndarray = field(metadata={"unit": "", "array": "coherence"})
     cross_transfer_error: np.ndarray = field(metadata={"unit": "", "array": "coherence_error"})
-    horizon_delay: np.ndarray = field(metadata={"unit": "s"})
 
 
 @dataclass(frozen=True)
@@ -192,23 +180,14 @@ class Injection:
     response: DelaySpectra
     cross: DelaySpectra
 
-    def __post_init__(self) -> None:
-        for name in ("response", "cross"):
-            if getattr(self, name).power.shape != self.signal.power.shape:
-                raise ValueError(
-                    f"the {name} has {getattr(self, name).power.shape} units and delays, expected those of the signal, "
-                    f"{self.signal.power.shape}"
-                )
-
 
 def where_measured(found: TransferFunction) -> TransferFunction:
     """Return a transfer function in which bins whose T is not measured hold NaN, but for the signal."""
-    names = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence")
     unknown = np.array(
         [not is_measured(*pair) for pair in zip(found.transfer, found.transfer_error, strict=True)], bool
     )
     changes: dict[str, Any] = {
-        name: np.where(unknown, np.nan, getattr(found, name)) for stem in names for name in (stem, f"{stem}_error")
+        name: np.where(unknown, np.nan, getattr(found, name)) for stem in RATIOS for name in (stem, f"{stem}_error")
     }
     return replace(found, **changes)
 
@@ -216,13 +195,8 @@ def where_measured(found: TransferFunction) -> TransferFunction:
 def signal_response(with_signal: UVData, without_signal: UVData) -> UVData:
     """Return D, the difference of two residuals of the same noise, with and without the signal in the data.
 
-    Samples that are flagged in either are flagged; the inputs are not changed. Raise ValueError if the shapes differ.
+    Samples that are flagged in either are flagged; the inputs are not changed.
     """
-    if with_signal.data_array.shape != without_signal.data_array.shape:
-        raise ValueError(
-            f"the residuals have shapes {with_signal.data_array.shape} with the signal and "
-            f"{without_signal.data_array.shape} without, expected the same"
-        )
     response = with_signal.copy()
     response.data_array = with_signal.data_array - without_signal.data_array
     response.flag_array = with_signal.flag_array | without_signal.flag_array
@@ -337,17 +311,15 @@ def pool(transfers: Sequence[TransferFunction]) -> TransferFunction:
     """Return the transfer function of several injections together, such as EoR skies of different seeds.
 
     Each enters with its signal's power, as if its modes were further modes of one injection, and errors add up as those
-    of independent skies. A number that is NaN in some of them is that of the others. Raise ValueError if there is none,
-    or if their bins differ.
+    of independent skies. A number that is NaN in some of them is that of the others. Raise ValueError if their bins
+    differ.
     """
-    if not transfers:
-        raise ValueError("no transfer function to pool, expected at least one")
     first = transfers[0]
     if any(not np.array_equal(other.bin_edges, first.bin_edges) for other in transfers):
         raise ValueError("the transfer functions have different bins, expected the same")
     signal = np.stack([item.signal for item in transfers])
     found: dict[str, np.ndarray] = {}
-    for name in ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherence"):
+    for name in RATIOS:
         values, errors = (np.stack([getattr(item, key) for item in transfers]) for key in (name, f"{name}_error"))
         weights = np.where(np.isfinite(values), signal, 0.0)
         weights = np.divide(weights, weights.sum(axis=0), out=np.full(weights.shape, np.nan), where=weights > 0)
@@ -376,10 +348,8 @@ def correct(spectrum: SphericalSpectrum, transfer: TransferFunction, reduced: bo
     Errors of P^R and T are independent. Those of P^R are divided by T if they are `reduced` like P^R, as errors of
     what is left in measured data. Those of simulations are of all noise and EoR, of which the calibration takes as much
     as of the signal: dividing P^R by T restores both. NaN where too little is left to be corrected, or where most
-    of it is not the EoR at this k (`correctable`). Raise ValueError if the bins differ.
+    of it is not the EoR at this k (`correctable`). Bins are the same.
     """
-    if not np.array_equal(spectrum.bin_edges, transfer.bin_edges):
-        raise ValueError("spectrum and transfer function have different bins, expected the same")
     known = correctable(
         transfer.transfer, transfer.transfer_error, transfer.cross_transfer, transfer.cross_transfer_error
     )
@@ -421,11 +391,8 @@ def bin_expected(
     """
     limits = np.asarray(edges, float)
     known = np.isfinite(transfer)
-    bins = bins_of_k(modes, limits, buffer)
-    used = (bins >= 0) & known
-    count = np.bincount(bins[used], minlength=limits.size - 1)
-    total = np.bincount(bins[used], transfer[used], limits.size - 1)
-    square = np.bincount(bins[used], error[used] ** 2, limits.size - 1)
+    bins = np.where(known, bins_of_k(modes, limits, buffer), -1)
+    count, total, square = (sum_in_bins(values, bins, limits.size - 1) for values in (np.ones(()), transfer, error**2))
     filled = np.where(count > 0, count, np.nan)
     length_edges, row = length_bins(modes.length, length_bin)
     spacing = modes.delay[1] - modes.delay[0]
@@ -454,10 +421,9 @@ def bin_response(
     """
     limits = np.asarray(edges, float)
     bins = bins_of_k(modes, limits, buffer)
-    used = bins >= 0
     first, second = responses
     left, crossed, put_in = (
-        np.bincount(bins[used], np.real(one.conj() * other)[used], limits.size - 1)
+        sum_in_bins(np.real(one.conj() * other), bins, limits.size - 1)
         for one, other in ((first, second), (signal, (first + second) / 2), (signal, signal))
     )
     put_in = np.where(put_in > 0, put_in, np.nan)

@@ -21,10 +21,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-from calstudy.power.spectra import BaselineModes, bins_of_k
+from calstudy.power.spectra import BaselineModes, bins_of_k, sum_in_bins
 
 LEAST = 0.1
 """Smallest W_bb with which a bin b has a result."""
@@ -60,45 +59,29 @@ class UnbiasedSpectrum:
         return self.window.sum(axis=1)
 
 
-class BinSignals:
-    """Random signals with a power of one in one bin of k.
+def draw_in_bins(
+    frequency: np.ndarray,
+    lengths: np.ndarray,
+    groups: tuple[np.ndarray, np.ndarray],
+    edges: np.ndarray,
+    cosmology: str,
+    rng: np.random.Generator,
+) -> Iterator[np.ndarray]:
+    """Yield a signal for each bin, complex, (Nbls, Nfreqs): parts of one with a mean square of one per channel.
 
-    Parameters
-    ----------
-    frequency : channel centres, Hz, ascending and evenly spaced, (Nfreqs,)
-    lengths : baseline lengths, m, (Nbls,)
-    groups, conjugated : number of the redundant group of each baseline, and whether it is reversed in it, (Nbls,)
-    edges : of the bins, h/Mpc, ascending
-    cosmology : name of one of astropy's
+    Channel centres are in Hz, evenly spaced, baseline lengths in m, (Nbls,), and edges of the bins of k in h/Mpc.
+    `groups` are the number of the redundant group of each baseline, and whether it is reversed in it, (Nbls,) each.
     """
-
-    def __init__(
-        self,
-        frequency: np.ndarray,
-        lengths: np.ndarray,
-        groups: np.ndarray,
-        conjugated: np.ndarray,
-        edges: ArrayLike,
-        cosmology: str,
-    ) -> None:
-        self._n_channels, self._groups, self._conjugated = frequency.size, groups, conjugated
-        astropy, centre = make_cosmology(cosmology), float(frequency.mean())
-        self._n_delays = FINER * frequency.size
-        delay = np.fft.fftfreq(self._n_delays, float(np.diff(frequency).mean()))
-        k = np.hypot(k_perpendicular(astropy, lengths, centre)[:, None], k_parallel(astropy, delay, centre))
-        limits = np.asarray(edges, float)
-        self._n_bins = limits.size - 1
-        self._bins = np.clip(np.searchsorted(limits, k, side="left") - 1, 0, self._n_bins - 1)
-
-    def draw(self, rng: np.random.Generator) -> Iterator[np.ndarray]:
-        """Yield a signal for each bin, complex, (Nbls, Nfreqs): parts of one with a mean square of one per channel."""
-        shape = (2, self._groups.max() + 1, self._n_delays)
-        real, imaginary = rng.standard_normal(shape) / np.sqrt(2 * self._n_delays)
-        amplitudes = (real + 1j * imaginary)[self._groups]
-        for number in range(self._n_bins):
-            inside = np.where(self._bins == number, amplitudes, 0)
-            signal = np.fft.ifft(inside, axis=1, norm="forward")[:, : self._n_channels]
-            yield np.where(self._conjugated[:, None], signal.conj(), signal)
+    (group, conjugated), n_delays, n_bins = groups, FINER * frequency.size, edges.size - 1
+    astropy, centre = make_cosmology(cosmology), float(frequency.mean())
+    delay = np.fft.fftfreq(n_delays, float(np.diff(frequency).mean()))
+    k = np.hypot(k_perpendicular(astropy, lengths, centre)[:, None], k_parallel(astropy, delay, centre))
+    bins = np.clip(np.searchsorted(edges, k, side="left") - 1, 0, n_bins - 1)
+    real, imaginary = rng.standard_normal((2, group.max() + 1, n_delays)) / np.sqrt(2 * n_delays)
+    amplitudes = (real + 1j * imaginary)[group]
+    for number in range(n_bins):
+        signal = np.fft.ifft(np.where(bins == number, amplitudes, 0), axis=1, norm="forward")[:, : frequency.size]
+        yield np.where(conjugated[:, None], signal.conj(), signal)
 
 
 def window_matrix(
@@ -106,24 +89,16 @@ def window_matrix(
 ) -> np.ndarray:
     """Return W, (Nk, Nk), NaN in rows of bins without modes outside the wedge.
 
-    Parameters
-    ----------
-    modes : of the baselines
-    left
-        Amplitudes of what two fits, to data with independent noise, leave of the signals of each bin, complex,
-        (Ndraws, Nk, Nbls, Ndelays).
-    put_in
-        Power of the amplitudes of the signals themselves, of all bins together, mean over draws, (Nbls, Ndelays): what
-        is left is measured against it, free of the sample variance of the signals.
-    edges, buffer : as in `calstudy.power.transfer.bin_response`
+    `left` are amplitudes of what two fits, to data with independent noise, leave of the signals of each bin, complex,
+    (Ndraws, Nk, Nbls, Ndelays). They are measured against `put_in`, the power of the amplitudes of the signals
+    themselves, of all bins together, mean over draws, (Nbls, Ndelays): free of the sample variance of the signals.
+    `edges` and `buffer` are as in `calstudy.power.transfer.bin_response`.
     """
-    n_bins = edges.size - 1
-    bins = bins_of_k(modes, edges, buffer)
-    used = bins >= 0
+    n_bins, bins = edges.size - 1, bins_of_k(modes, edges, buffer)
     even, odd = left
     power = np.mean((even.conj() * odd).real, axis=0)
-    whole = np.bincount(bins[used], put_in[used], n_bins)
-    sums = np.array([np.bincount(bins[used], part[used], n_bins) for part in power]).T
+    whole = sum_in_bins(put_in, bins, n_bins)
+    sums = np.array([sum_in_bins(part, bins, n_bins) for part in power]).T
     return sums / np.where(whole > 0, whole, np.nan)[:, None]
 
 

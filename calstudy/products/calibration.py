@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -56,6 +57,15 @@ def calibration_inputs(graph: Graph, variant: Variant, parity: str) -> dict[str,
         "sky_model": sky_model.sky_model(graph),
         "levels": corruption.noise_level(graph, variant) if calibrator.needs_noise else None,
         "autocorrelations": corruption.autocorrelations(graph, variant, parity) if calibrator.needs_autos else None,
+    }
+
+
+def solved(graph: Graph, variant: Variant, parity: str) -> dict[str, Any]:
+    """Return the fields of what is made of the calibration of one noise realization ("even" or "odd") of a variant."""
+    return {
+        "calibration": calibration(graph, variant, parity),
+        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
+        **calibration_inputs(graph, variant, parity),
     }
 
 
@@ -120,11 +130,7 @@ def read_result(folder: Path) -> CalibrationResult:
 
 
 class Calibrated(Task):
-    """What is made of data that are calibrated.
-
-    There may be a sky model, the level of the noise if the calibrator needs it, and the autocorrelations if it needs
-    them and the data have none.
-    """
+    """What is made of data that are calibrated; autocorrelations are apart if only the calibrator needs them."""
 
     data: Input
     sky_model: Input = None
@@ -161,8 +167,8 @@ class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
         result.gains.write_calh5(output / GAINS)
         for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):
             write_visibilities(uvd, output / name, single=True)
-        summary = {**result.summary(), "remarks": remarks}
-        write_json(output / SOLUTION, summary)
+        summary = result.summary()
+        write_json(output / SOLUTION, {**summary, "remarks": remarks})
         return {"by_status": summary["by_status"]}
 
     def _cost(self) -> Cost:
@@ -195,9 +201,8 @@ class Calibrate(Task, stage="calibrate", version=2):
         records = [record for solution in solutions for record in solution["records"]]
         remarks = list(dict.fromkeys(text for solution in solutions for text in solution.get("remarks", [])))
         records.sort(key=lambda record: (record["polarization"], record["time"]))
-        by_status = dict.fromkeys(sorted({record["status"] for record in records}), 0)
+        by_status = dict(sorted(Counter(record["status"] for record in records).items()))
         for record in records:
-            by_status[record["status"]] += 1
             record["integration"] = int(np.abs(gains.time_array - record["time"]).argmin())
         write_json(output / SOLUTION, {"by_status": by_status, "records": records})
         seconds = [record["seconds"] for record in records]
@@ -219,21 +224,19 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
     if not unconverged:
         return []
     example = unconverged[0]
-    stalled = [
-        "where solves stall, results depend on where they start: T is not determined better than by the spread of two "
-        "starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not depend on them"
-    ]
     lost = sum(record["status"] not in USABLE for record in records) / len(records)
-    without = [
+    sentences = {
+        "where solves stall, results depend on where they start: T is not determined better than by the spread of two "
+        "starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not depend on "
+        "them": "stalled" in by_status,
         f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost; in a simulation, errors of "
-        "spectra by noise count them, and are too small by as much"
-    ]
-    return (
-        (stalled if "stalled" in by_status else [])
-        + (without if 0 < lost < 1 else [])
-        + [
-            f"{len(unconverged)} of {len(records)} solves did not converge "
-            f"({', '.join(f'{count} {status}' for status, count in by_status.items())}); integration "
-            f"{example['integration']}: {example['message']}"
-        ]
-    )
+        "spectra by noise count them, and are too small by as much": 0 < lost < 1,
+        f"{len(unconverged)} of {len(records)} solves did not converge ({in_words(by_status)}); integration "
+        f"{example['integration']}: {example['message']}": True,
+    }
+    return [sentence for sentence, is_so in sentences.items() if is_so]
+
+
+def in_words(by_status: Mapping[str, int]) -> str:
+    """Return numbers of solves by status in words."""
+    return ", ".join(f"{count} {status}" for status, count in by_status.items())

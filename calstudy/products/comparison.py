@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,10 +16,10 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table, number
 from calstudy.power.score import BANDS, HEADLINE_BAND, SPECTRA, CalibratedSpectra, Score, difference
 from calstudy.power.tables import load_spectrum
-from calstudy.products import spectra
+from calstudy.products.calibration import in_words
 from calstudy.products.files import COMPARISON, SCORE, SCORE_BANDS, SCORE_BINS, read_json
 from calstudy.products.graph import size_of
-from calstudy.products.signal_loss import statuses
+from calstudy.products.signal_loss import read_calibrated
 from calstudy.products.tolerances import COUNTS, faults, tolerance
 from calstudy.run.task import Inputs, Task
 from calstudy.verdicts.standing import (
@@ -40,18 +41,11 @@ NOTE = (
     "EoR, both free of the flux scale s, outside the wedge, k in h/Mpc, one standard deviation. All numbers are in "
     "comparison.md and comparison.csv."
 )
-DIFFERENCES = ("transfer", "transfer_error", "bias", "bias_error")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One calibrator in one world.
-
-    Attributes
-    ----------
-    bins, bands : its scores in the experiment's bins of k, and in wide bands
-    summary : all of its numbers, as in score.json
-    """
+    """One calibrator in one world: scores in the experiment's bins of k and in wide bands, and all of score.json."""
 
     bins: Score
     bands: Score
@@ -120,11 +114,7 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
 
 
 class Comparison(Task, stage="comparison", version=11):
-    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there.
-
-    The table has C beside T since version 9, and verdicts the linear response where it is lower since 10. Advice says
-    that no bias is seen only where none is since 11.
-    """
+    """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
 
     title: str
     calibrators: Sequence[str]
@@ -176,12 +166,11 @@ class Comparison(Task, stage="comparison", version=11):
                 less = difference(pair, BANDS, self.wedge_buffer, (scales[name], scales[leader]))
                 for band, entry in enumerate(bands):
                     if entry["best"] == leader:
-                        entry |= {key: json_number(getattr(less, key)[band]) for key in DIFFERENCES}
+                        entry |= {key: json_number(values[band]) for key, values in less.items()}
         return result
 
     def _spectra(self, case: str) -> CalibratedSpectra:
-        folders = {name: self.cases[f"{case}:{name}"] for name in SPECTRA}
-        return CalibratedSpectra(**{name: spectra.read_delay_spectra(folder) for name, folder in folders.items()})
+        return read_calibrated({name: self.cases[f"{case}:{name}"] for name in SPECTRA})
 
     def _cost(self) -> Cost:
         cases = len(self.worlds) * len(self.calibrators)
@@ -212,7 +201,7 @@ def _csv_rows(
                     "gain error aligned": summary["gain_error_aligned"],
                     "gain error as fitted": summary["gain_error_as_fitted"],
                     "chi squared of held-out data": summary["held_out_chi_squared"],
-                    "solves": statuses(summary),
+                    "solves": in_words(summary["by_status"]),
                     "CPU seconds per integration": summary["cpu_seconds_per_integration"],
                     "peak memory [bytes]": summary["peak_memory"],
                 }
@@ -311,27 +300,28 @@ def _sky_models(found: Mapping[str, Case]) -> str:
 
 def score_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return the scores of one world, contents of score.json by calibrator, as a table with a row for each."""
-    bands = [band["k"] for band in next(iter(found.values()))["bands"]]
-    measured = [f"{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
-    cost = ("CPU s per integration", "memory")
-    headings = ("calibrator", *measured, "s", "gain error", "as fitted", "χ²", "solves", *cost)
     rows = []
     for name, summary in found.items():
-        values = [_transfer_cell(band) for band in summary["bands"]]
-        values += [_cell(band["bias"], band["bias_error"]) for band in summary["bands"]]
+        seconds, memory = _cost_cells(summary)
         rows.append(
-            (
-                name,
-                *values,
-                _cell(summary["flux_scale"], decimals=4),
-                _percent(summary["gain_error_aligned"]),
-                _percent(summary["gain_error_as_fitted"]),
-                _cell(summary["held_out_chi_squared"], decimals=3),
-                statuses(summary),
-                *_cost_cells(summary),
-            )
+            {
+                "calibrator": name,
+                **{_heading("transfer", band): _transfer_cell(band) for band in summary["bands"]},
+                **{_heading("bias", band): _cell(band["bias"], band["bias_error"]) for band in summary["bands"]},
+                "s": _cell(summary["flux_scale"], decimals=4),
+                "gain error": _percent(summary["gain_error_aligned"]),
+                "as fitted": _percent(summary["gain_error_as_fitted"]),
+                "χ²": _cell(summary["held_out_chi_squared"], decimals=3),
+                "solves": in_words(summary["by_status"]),
+                "CPU s per integration": seconds,
+                "memory": memory,
+            }
         )
-    return Table(headings, rows)
+    return Table.of_records(rows)
+
+
+def _heading(name: str, band: Mapping[str, Any]) -> str:
+    return f"{QUANTITIES[name]}, {band['k'][0]:g} to {band['k'][1]:g}"
 
 
 def _transfer_cell(band: Mapping[str, Any]) -> str:
@@ -349,20 +339,14 @@ def _transfer_cell(band: Mapping[str, Any]) -> str:
 
 def _difference_table(less: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
     """Return differences from the best calibrator as a table, a row for each calibrator."""
-    bands = [band["k"] for band in next(iter(less.values()))]
-    headings = [f"Δ{QUANTITIES[key]}, {low:g} to {high:g}" for key in ("transfer", "bias") for low, high in bands]
-    rows = [
-        (
-            name,
-            *(
-                "best" if band["best"] == name else _cell(band.get(key), band.get(f"{key}_error"))
-                for key in ("transfer", "bias")
-                for band in found
-            ),
-        )
-        for name, found in less.items()
-    ]
-    return Table(("calibrator", *headings), rows)
+    rows = []
+    for name, found in less.items():
+        row = {"calibrator": name}
+        for key, band in itertools.product(("transfer", "bias"), found):
+            cell = "best" if band["best"] == name else _cell(band.get(key), band.get(f"{key}_error"))
+            row[f"Δ{_heading(key, band)}"] = cell
+        rows.append(row)
+    return Table.of_records(rows)
 
 
 def _cost_cells(summary: Mapping[str, Any]) -> tuple[str, str]:

@@ -145,10 +145,7 @@ def _nights(noise: Noise) -> int | None:
 
 @memoize
 def autocorrelations(graph: Graph, variant: Variant, parity: str) -> Task:
-    """Return the task of the autocorrelations of one noise realization ("even" or "odd") of a variant.
-
-    They do not contain the EoR, which is far below their noise.
-    """
+    """Return the task of the autocorrelations of one realization, without the EoR, which is far below their noise."""
     noise = graph.experiment.corruption.noise
     if isinstance(noise, NoNoise):
         raise LookupError("autocorrelations: corruption.noise is 'none'")

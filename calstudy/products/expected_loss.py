@@ -26,8 +26,8 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import BaselineModes, modes_of
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import ExpectedBins, bin_expected, bin_response
-from calstudy.products import calibration, corruption
-from calstudy.products.calibration import Calibrated, prepared_fit
+from calstudy.products import corruption
+from calstudy.products.calibration import Calibrated, prepared_fit, solved
 from calstudy.products.files import (
     DATA,
     EXPECTED,
@@ -105,13 +105,8 @@ def linear_response(graph: Graph) -> Task | None:
 
 def solved_inputs(graph: Graph, parity: str = "even") -> dict[str, Any]:
     """Return the fields of a `Solved` for the middle integration of one realization of the residual."""
-    residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
-    return {
-        **calibration.calibration_inputs(graph, residual, parity),
-        "calibration": calibration.calibration(graph, residual, parity),
-        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
-        "integration": graph.experiment.instrument.times.count // 2,
-    }
+    residual, times = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]], graph.experiment.instrument.times
+    return {**solved(graph, residual, parity), "integration": times.count // 2}
 
 
 @dataclass(frozen=True)
@@ -183,10 +178,7 @@ class Solved(Calibrated):
 
 
 class ExpectedLoss(Solved, stage="expected-loss", version=5):
-    """The expected T of one calibrated integration; since version 5 that of all that were solved together.
-
-    Baselines of equal lengths share a bin since then.
-    """
+    """The expected T of one calibrated integration, with those that were solved together with it."""
 
     probes: int
 
@@ -232,10 +224,7 @@ class Responses(Solved):
 
 
 class Response(Responses, stage="response", version=2):
-    """The linear response of one calibrated integration to a signal.
-
-    Since version 2 baselines without weight have one, and flagged samples no signal.
-    """
+    """The linear response of one calibrated integration to a signal, without that of flagged samples."""
 
     signal: Input
 

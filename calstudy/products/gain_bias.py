@@ -17,7 +17,6 @@ from calstudy.instrument.settings import Channels, Times
 from calstudy.power.gain_bias import FALLEN, ErrorCovariance, GainBias, bias_terms, exponential
 from calstudy.power.score import BANDS
 from calstudy.power.settings import PowerSettings
-from calstudy.power.spectra import of_common_units
 from calstudy.power.tables import save_spectrum
 from calstudy.products import spectra
 from calstudy.products.graph import Graph, memoize, required, size_of
@@ -63,8 +62,8 @@ class ExpectGainBias(Task, stage="gain-bias", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the expected bias to gain-bias.h5."""
-        parts = {name: spectra.read_delay_spectra(getattr(self, name)) for name in ("foregrounds", "signal")}
-        parts, effect, width = of_common_units(parts), self.effect, self.channels.width
+        parts = spectra.read_common({"foregrounds": self.foregrounds, "signal": self.signal})
+        effect, width = self.effect, self.channels.width
         shape = cast(Correlated, effect.shape)
         duration = self.times.integration * self.times.count
         per_block = -(-self.times.count // self.power.n_blocks(duration, self.times.integration))

@@ -22,15 +22,14 @@ from calstudy.calibrate.gain_realizations import GainRealizations
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import RUNAWAY, GainFit, UnityStart
 from calstudy.experiment.model import Variant
-from calstudy.products import calibration, corruption, observed
-from calstudy.products.calibration import Calibrated, prepared_fit, read_result
+from calstudy.products import corruption, observed
+from calstudy.products.calibration import Calibrated, prepared_fit, read_result, solved
 from calstudy.products.files import GAINS, write_json
 from calstudy.products.graph import Graph, MeasuredGraph, memoize, size_of
 from calstudy.run.task import Input, Task, called
 
 if TYPE_CHECKING:
     from calstudy.calibrate.records import CalibrationResult, Solve
-    from calstudy.products.selection import Gains
 
 
 ERRORS = "gain-errors.json"
@@ -41,19 +40,13 @@ FAR_ABOVE, MODERATE, EVEN = 5.0, 20.0, 2.0
 the residual above which something else does."""
 RAN_AWAY = "the weights, from the gains, do not settle: the gains are lost in noise"
 NAMED = 6
-"""Largest number of antennas named in a warning; solution.json has all of them."""
+"""Largest number of antennas named in a warning."""
 OTHER_WEIGHTS = "take `weights: autos` if the data have autocorrelations"
 REMEDY = "solve more integrations together (integrations_per_solve), or smooth the gains (smooth_gains)"
 
 
 class SolvedGains(NamedTuple):
-    """The gains of a solve, with their errors or the reason why there are none.
-
-    Attributes
-    ----------
-    rows, times, place : antennas, integrations and polarization in the gains of the calibration
-    gains : complex, (Nants, Nfreqs)
-    """
+    """The gains of a solve, complex, (Nants, Nfreqs), their places in all gains, and errors or why there are none."""
 
     rows: np.ndarray
     times: slice
@@ -66,15 +59,6 @@ class SolvedGains(NamedTuple):
 def gain_errors(graph: Graph, variant: Variant, parity: str) -> Task:
     """Return the task of the errors of the gains of a calibration of simulated data."""
     return ErrorsOfGains(LABEL, **solved(graph, variant, parity))
-
-
-def solved(graph: Graph, variant: Variant, parity: str) -> dict[str, Any]:
-    """Return the fields of `OfSolves` for one noise realization ("even" or "odd") of a variant."""
-    return {
-        "calibration": calibration.calibration(graph, variant, parity),
-        "calibrator": graph.experiment.calibration.with_defaults("assumed"),
-        **calibration.calibration_inputs(graph, variant, parity),
-    }
 
 
 @memoize
@@ -156,11 +140,7 @@ class OfSolves(Calibrated):
 
 
 class ErrorsOfGains(OfSolves, stage="gain-errors", version=8):
-    """The gains of a calibration with their errors; since version 5 antennas whose gains are noise are flagged.
-
-    Since version 6 fits with a taper have no errors by their matrix. Since version 7 integrations without data, which
-    share gains with others, have no errors and do not count. Since version 8 realizations have the noise of each solve
-    and sample.
+    """The gains of a calibration with their errors; antennas whose gains are noise are flagged.
 
     If no solve has errors by its own matrix, they come from fits to this many `realizations` of the noise, unless it is
     zero.
@@ -262,8 +242,7 @@ def lost_antennas(records: Sequence[Mapping[str, Any]]) -> list[str]:
 def lost_in_noise(gains: np.ndarray, errors: np.ndarray, unevenness: float) -> list[str]:
     """Return a sentence if noise alone makes gains that are far above the others of their antenna; none otherwise.
 
-    Gains and the errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error. The unevenness is the
-    largest of all solves.
+    Gains and errors of their amplitudes are (Nants, Nfreqs, Ntimes, Npols); NaN is no error.
     """
     sizes = np.where(np.isfinite(errors), np.abs(gains), np.nan)
     known = np.isfinite(sizes).any(axis=(1, 2, 3))
@@ -302,19 +281,17 @@ class MeasureCoverage(OfSolves, stage="gain-coverage", version=4):
         from calstudy.products.selection import read_gains
 
         result, found, reasons = read_result(self.calibration), [], []
-        true: dict[int, Gains] = {}
+        feeds = range(0 if self.gains is None else result.model.Npols)
+        true = [read_gains(self.gains, place) for place in feeds]
         for solve in self.solves(result):
             if isinstance(solve.errors, str):
                 reasons.append(solve.errors)
                 continue
             numbers = result.gains.ant_array[solve.rows]
             reference = np.ones(solve.gains.shape)
-            if self.gains is not None:
-                if solve.place not in true:
-                    true[solve.place] = read_gains(self.gains, solve.place)
-                of_feed = true[solve.place]
+            if true:
                 together = range(solve.times.start, solve.times.stop)
-                reference = np.mean([of_feed.at(time, numbers) for time in together], axis=0)
+                reference = np.mean([true[solve.place].at(time, numbers) for time in together], axis=0)
             found.append(pulls(solve.errors, solve.gains, reference))
         if not found:
             raise InputError(f"no errors of gains: {'; '.join(sorted(set(reasons)))}")

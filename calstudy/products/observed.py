@@ -133,14 +133,7 @@ def noise_power(graph: MeasuredGraph, what: str, source: str) -> Task:
 
 
 class Observe(Task, stage="observe", version=7):
-    """The data of one part, and the sky model.
-
-    The noise is that of a sample with nsamples of one since version 2, and has the mean of inverse variances since 3.
-    Samples of no measurement are flagged since 4. Windows are in the order of their frequencies since 5, and data with
-    renamed feeds have a keyword that says so. Since 7, samples that are flagged in the sky model are flagged, halves
-    have the convention I = XX + YY, a file without counts of measurements has counts of one, and samples are copied
-    only where averaging differs between baselines.
-    """
+    """The data of one part, and the sky model at the same samples."""
 
     files: Sequence[Path]
     select: Select
@@ -268,10 +261,7 @@ def read_observed(folder: Path, calibrator: Calibrator, sky_model: bool) -> tupl
 
 
 class ObservedAverage(InBlocks, stage="observed-average", version=2):
-    """The average of one half; all averages have the samples, flags and baselines of the residual.
-
-    Noise is known where the autocorrelations tell that of some of the samples since version 2, not only of all.
-    """
+    """The average of one half; all averages have the samples, flags and baselines of the residual."""
 
     what: str
     data: Input

@@ -197,7 +197,7 @@ class SimulateEor(Task, stage="observed-eor", version=3):
 
 
 class SetLevel(Task, stage="observed-level", version=2):
-    """The factor of the EoR, from cross-correlations; since version 2 also where autocorrelations are calibrated."""
+    """The factor of the EoR, from cross-correlations."""
 
     level: float | None
     eor: Input
@@ -275,7 +275,7 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
 
 
 class ObservedTransfer(Injected, stage="observed-transfer", version=6, cost=Cost(4, disk=1e6)):
-    """T of measured data; baselines of equal lengths share a bin since version 5."""
+    """T of measured data."""
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write T, spectra of the injected EoR, and the power of the residual corrected by T."""
@@ -353,10 +353,7 @@ class _OfData(Task):
 
 
 class ExpectedLossOfData(_OfData, stage="observed-expected-loss", version=3):
-    """The expected T of the middle solve of one half of measured data, of the first polarization that has solutions.
-
-    Equal lengths share a bin since version 3.
-    """
+    """The expected T of the middle solve of one half of measured data, of the first polarization that has solutions."""
 
     power: PowerSettings
 

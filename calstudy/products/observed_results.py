@@ -85,10 +85,7 @@ class ObservedTable(StudyTable):
 
 
 class ObservedSpectra(Task, stage="observed-spectra", version=2, cost=Cost(10, disk=5e6)):
-    """Wedge and spherical spectra; errors are those of the noise, from the difference of halves on each baseline.
-
-    Baselines of the same vector have their own noise, and equal lengths share a bin, since version 2.
-    """
+    """Wedge and spherical spectra; errors are those of the noise, from the difference of halves on each baseline."""
 
     power: PowerSettings
     delays: Inputs
@@ -192,11 +189,7 @@ def _shown(ratio: Mapping[str, float | None] | None) -> str:
 
 
 class ObservedQuality(Task, stage="observed-quality", version=3):
-    """The quality of a calibration: chi^2 against the noise, and outliers.
-
-    High gains are ascribed to noise where the data are as elsewhere since version 2. Polarizations are named as in the
-    file since 3.
-    """
+    """The quality of a calibration: chi^2 against the noise, and outliers."""
 
     calibrator: Calibrator = called("calibration")
     autos: bool

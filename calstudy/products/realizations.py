@@ -115,10 +115,7 @@ DRAWN_FOR = {"eor": "noise", "input": "eor"}
 
 @memoize
 def realization_graphs(graph: Graph) -> list[Graph]:
-    """Return the graphs of all realizations of an experiment; the first is the experiment's own.
-
-    Visibilities of the others are removed from the store after their reduction.
-    """
+    """Return the graphs of all realizations; the first is the experiment's own, and keeps its visibilities."""
     found = expand_realizations(graph.experiment)
     return [Graph(item.experiment, keep_visibilities=place == 0) for place, item in enumerate(found)]
 
@@ -176,22 +173,20 @@ class Reduced(Task, stage="realization", version=2, cost=Cost(10, disk=1e6)):
         power = self.power
         delays = {name: spectra.read_delay_spectra(getattr(self, name)) for name in SIGNAL_LOSS_VARIANTS}
         residual, without, eor = SIGNAL_LOSS_VARIANTS
-        noise = dict.fromkeys((residual, without), 0.0)
+        noise = {}
         if self.noise is not None:
             level = noise_level(spectra.read_delay_spectra(self.noise))
-            noise = {name: level * spectra.excess_noise(getattr(self, name), self.noise) for name in noise}
+            noise = {
+                name: level * spectra.excess_noise(getattr(self, name), self.noise) for name in (residual, without)
+            }
         for region in REGIONS:
             means = {
                 name: spherical_average(found, power, region == "outside-wedge", region == "inside-wedge")
                 for name, found in delays.items()
             }
-            errors: dict[str, dict[str, Any]] = {
-                residual: {"noise": noise[residual], "signal": means[eor]},
-                without: {"noise": noise[without]},
-                eor: {"signal": means[eor]},
-            }
             for name, mean in means.items():
-                save_spectrum(output / spectrum_file(name, region), with_errors(mean, **errors[name]))
+                found = with_errors(mean, noise.get(name, 0.0), None if name == without else means[eor])
+                save_spectrum(output / spectrum_file(name, region), found)
         edges = make_bin_edges(power.bins)
         put_in = input_power(self.eor_settings, (edges[1:] + edges[:-1]) / 2, power.cosmology, self.band)
         factor = read_json(self.levels / LEVELS)["eor_factor"]
@@ -252,10 +247,7 @@ class RegionResults:
         return self.covered[kind][list(self.pooled.design.blocks[place][1])]
 
     def corrected_over(self, power: np.ndarray, bins: np.ndarray, known_scale: bool = False) -> Finding | None:
-        """Return the mean of P^R / T over another power, (K, Nk), in some bins; None where T is not known.
-
-        With `known_scale`, it is the mean for P^R s^2 / (T s^2).
-        """
+        """Return the mean of P^R / T, or P^R s^2 / (T s^2), over a power, (K, Nk), in some bins; None without T."""
         if self.corrected is None:
             return None
         corrected = self.corrected.power_known_scale if known_scale else self.corrected.power
@@ -362,13 +354,12 @@ def _csv_rows(
                     row[f"{name} {kind}"] = float(getattr(pooled_quantity, kind)[column])
             for kind, inside in results.covered.items():
                 row[f"covered: {kind.replace('_', ' ')}"] = _mean_of_known(inside[places, column])
-            if results.corrected is not None:
-                row["P^R / T [mK2 h-3 Mpc3]"] = _mean_of_known(results.corrected.power[places, column])
-                row["sigma from P^S [mK2 h-3 Mpc3]"] = _mean_of_known(results.corrected.error[places, column])
-                row["sigma from input [mK2 h-3 Mpc3]"] = _mean_of_known(
-                    results.corrected.error_with_sample[places, column]
-                )
-                row["why not corrected"] = str(results.corrected.reasons[column])
+            if (corrected := results.corrected) is not None:
+                powers = {"P^R / T": corrected.power, "sigma from P^S": corrected.error}
+                powers["sigma from input"] = corrected.error_with_sample
+                for name, values in powers.items():
+                    row[f"{name} [mK2 h-3 Mpc3]"] = _mean_of_known(values[places, column])
+                row["why not corrected"] = str(corrected.reasons[column])
             yield row
 
 
@@ -412,6 +403,10 @@ def _cell(found: Finding | None) -> str:
     return "-" if found is None or not np.isfinite(found.value) else number(found.value, found.uncertainty)
 
 
+def _mean(found: PooledRegion, name: str, bins: np.ndarray) -> str:
+    return _cell(mean_over_bins(found.values[name][:, bins], found.design))
+
+
 def _percent(found: Finding | None) -> str:
     if found is None or not np.isfinite(found.value):
         return "-"
@@ -424,11 +419,12 @@ def _rms(values: np.ndarray) -> float:
 
 def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> Table:
     """Return T, its scatter for each block of draws, and the ratio of that scatter to the quoted error."""
-    found = results.pooled
-    names = [described(block["draw"]) for block in blocks]
-    rows = []
+    found, rows = results.pooled, []
     for name, bins in _bands(found):
-        scatters = [f"{_rms(block.scatter[bins]):.4f}" for block in found.blocks["transfer"]]
+        scatters = {
+            f"scatter of T, {described(block['draw'])} drawn": f"{_rms(pooled.scatter[bins]):.4f}"
+            for block, pooled in zip(blocks, found.blocks["transfer"], strict=True)
+        }
         ratios = [
             error_ratio(*(values["transfer"][list(places)][:, bins] for values in (found.values, found.quoted)))
             for _, places in found.design.blocks
@@ -440,37 +436,29 @@ def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> 
         ratio = float(np.sqrt(counted * squares.sum()))
         error = counted * float(np.sqrt(sum((item.value * item.uncertainty) ** 2 for item in ratios)) / ratio)
         rows.append(
-            (
-                name,
-                *(_cell(mean_over_bins(found.values[key][:, bins], found.design)) for key in TRANSFER_QUANTITIES),
-                *scatters,
-                f"{_rms(total.quoted[bins]):.4f}",
-                _cell(Finding(ratio, error)),
-            )
+            {
+                "k [h/Mpc]": name,
+                **{quantity.symbol: _mean(found, key, bins) for key, quantity in TRANSFER_QUANTITIES.items()},
+                **scatters,
+                "quoted error of T": f"{_rms(total.quoted[bins]):.4f}",
+                "scatter over quoted": _cell(Finding(ratio, error)),
+            }
         )
-    symbols = [quantity.symbol for quantity in TRANSFER_QUANTITIES.values()]
-    drawn = [f"scatter of T, {name} drawn" for name in names]
-    return Table(("k [h/Mpc]", *symbols, *drawn, "quoted error of T", "scatter over quoted"), rows)
+    return Table.of_records(rows)
 
 
 def _power_table(results: RegionResults) -> Table:
     """Return P^R and P^R0 over P^S, the pulls, and the coverage of the bars of P^R."""
     found, rows = results.pooled, []
     for name, bins in _bands(found):
-        means = {key: mean_over_bins(found.values[key][:, bins], found.design) for key in QUANTITIES}
-        scatters = {key: f"{_rms(found.total[key].scatter[bins]):.2f}" for key in PULLS}
-        rows.append(
-            (
-                name,
-                *(_cell(means[key]) for key in QUANTITIES if key not in PULLS),
-                *(f"{_cell(means[key])}; {scatters[key]}" for key in PULLS),
-                _percent(results.coverage("eor", bins)),
-                _percent(results.coverage("input", bins)),
-            )
-        )
-    symbols = [quantity.symbol for key, quantity in QUANTITIES.items() if key not in PULLS]
-    pulls = [f"{QUANTITIES[key].symbol}: mean; scatter" for key in PULLS]
-    return Table(("k [h/Mpc]", *symbols, *pulls, "bars that cover P^S", "the input"), rows)
+        row = {"k [h/Mpc]": name}
+        for key, quantity in QUANTITIES.items():
+            scatter = f"; {_rms(found.total[key].scatter[bins]):.2f}" if key in PULLS else ""
+            row[quantity.symbol + (": mean; scatter" if scatter else "")] = _mean(found, key, bins) + scatter
+        row["bars that cover P^S"] = _percent(results.coverage("eor", bins))
+        row["the input"] = _percent(results.coverage("input", bins))
+        rows.append(row)
+    return Table.of_records(rows)
 
 
 def _corrected_table(results: RegionResults) -> Table:
@@ -478,24 +466,16 @@ def _corrected_table(results: RegionResults) -> Table:
     for name, bins in _bands(results.pooled):
         known = np.isfinite(results.corrected.power).all(axis=0)[bins] if results.corrected else np.zeros(0, bool)
         rows.append(
-            (
-                name,
-                _cell(results.corrected_over(results.put_in, bins)),
-                _cell(results.corrected_over(results.eor, bins)),
-                _percent(results.coverage("corrected_eor", bins)),
-                _percent(results.coverage("corrected_input", bins)),
-                f"{known.sum()} of {known.size}",
-            )
+            {
+                "k [h/Mpc]": name,
+                "P^R / T over input": _cell(results.corrected_over(results.put_in, bins)),
+                "over P^S": _cell(results.corrected_over(results.eor, bins)),
+                "intervals that cover P^S": _percent(results.coverage("corrected_eor", bins)),
+                "the input": _percent(results.coverage("corrected_input", bins)),
+                "bins corrected": f"{known.sum()} of {known.size}",
+            }
         )
-    headings = (
-        "k [h/Mpc]",
-        "P^R / T over input",
-        "over P^S",
-        "intervals that cover P^S",
-        "the input",
-        "bins corrected",
-    )
-    return Table(headings, rows)
+    return Table.of_records(rows)
 
 
 def _of_other_realizations(corrected: Corrected) -> str:

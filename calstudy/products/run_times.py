@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -56,76 +56,11 @@ of small pages can take longer than the measured work."""
 COLUMNS = ("panel", "size", "device", "antennas", "baselines", "longest [m]", "vectors", "coefficients", "timed")
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Numbers of samples: steps of the paper's solver, calls of our Adamax, and solves of the default solver.
-
-    A sample of a call is the mean of its `STEPS_PER_CALL` steps. Each solve is complete and cold, with its own noise.
-    """
-
-    steps: int
-    calls: int
-    solves: int
-
-
-@dataclass(frozen=True)
-class StepTimes:
-    """Run time and memory of the solvers for one array.
-
-    Attributes
-    ----------
-    longest : longest baseline, m
-    vectors : foreground vectors of the longest baseline, to which the paper pads all others
-    coefficients : foreground vectors of all baselines together
-    seconds
-        Samples by name: ``paper-step``, ``paper-sum`` (the sum over the basis alone), ``adamax-step``,
-        ``default-step``, ``default-solve``; processor seconds of one core, or elapsed seconds on a GPU.
-    basis_bytes : size of the paper's padded basis
-    paper_memory : bytes by which the paper's steps raised the memory of the process
-    """
-
-    antennas: int
-    baselines: int
-    longest: float
-    vectors: int
-    coefficients: int
-    seconds: dict[str, list[float]]
-    basis_bytes: int
-    paper_memory: int
-
-
-@dataclass(frozen=True)
-class Descent:
-    """Losses of the paper's solver on one problem: before the first step and after each, and the minimum (`floor`)."""
-
-    antennas: int
-    floor: float
-    losses: np.ndarray
-
-    def steps_to(self, excess: float) -> int | None:
-        """Return the number of steps until the loss is within this fraction of the minimum, or None if it never is."""
-        reached = np.flatnonzero(self.losses <= (1 + excess) * self.floor)
-        return int(reached[0]) if reached.size else None
-
-
-def time_steps_apart(array: Mapping[str, Any], samples: Samples, device: str) -> StepTimes:
-    """Time the solvers in a separate process; raises InputError with the last line of its output if it fails.
-
-    The array has JSON-able sections `layout`, `channels` and `basis`, and every baseline its own foreground model. The
-    device is ``cpu`` (one core) or ``gpu``.
-    """
-    return StepTimes(**_run_apart({"array": dict(array), "samples": asdict(samples), "device": device}))
-
-
-def descend_apart(array: Mapping[str, Any], max_steps: int) -> Descent:
-    """Run `descend` in a separate process; array and errors as for `time_steps_apart`."""
-    answer = _run_apart({"array": dict(array), "max_steps": max_steps})
-    return Descent(**{**answer, "losses": np.array(answer["losses"])})
-
-
-def _run_apart(request: Mapping[str, Any]) -> dict[str, Any]:
+def measured_apart(array: TimedArray, **request: Any) -> dict[str, Any]:
+    """Return what `step_times` answers in a separate process; raises InputError with its last line if it fails."""
+    text = json.dumps({"array": array.model_dump(mode="json"), **request})
     result = subprocess.run(
-        [sys.executable, "-m", MEASURING, json.dumps(request)],
+        [sys.executable, "-m", MEASURING, text],
         env={**os.environ, **ENVIRONMENT},
         capture_output=True,
         text=True,
@@ -133,8 +68,14 @@ def _run_apart(request: Mapping[str, Any]) -> dict[str, Any]:
     )
     if result.returncode:
         reason = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
-        raise InputError(f"the measurement of {json.dumps(request)} failed: {reason}")
+        raise InputError(f"the measurement of {text} failed: {reason}")
     return json.loads(result.stdout.splitlines()[-1])
+
+
+def steps_to(losses: np.ndarray, floor: float, excess: float) -> int | None:
+    """Return the number of steps until a loss is within a fraction of its minimum, `floor`; None if it never is."""
+    reached = np.flatnonzero(losses <= (1 + excess) * floor)
+    return int(reached[0]) if reached.size else None
 
 
 class TimedArray(Section):
@@ -186,8 +127,7 @@ class TimeSteps(Timed, stage="step-times", version=4):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Time the solvers, and write all samples to case.json."""
-        array = self.array.model_dump(mode="json")
-        found = asdict(time_steps_apart(array, Samples(**self.samples), self.device))
+        found = measured_apart(self.array, samples=dict(self.samples), device=self.device)
         case = {name: getattr(self, name) for name in ("panel", "size", "device", "machine")}
         write_json(output / CASE, {**case, **found})
         return {f"median {name}": float(np.median(samples)) for name, samples in found["seconds"].items()}
@@ -207,23 +147,20 @@ class CountSteps(Timed, stage="descent", version=2):
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Run the solver for `max_steps`, and count the steps to each of `EXCESSES`."""
-        found = descend_apart(self.array.model_dump(mode="json"), self.max_steps)
-        np.savez(output / LOSSES, allow_pickle=False, losses=found.losses, floor=found.floor)
+        found = measured_apart(self.array, max_steps=self.max_steps)
+        losses, floor = np.array(found["losses"]), found["floor"]
+        np.savez(output / LOSSES, allow_pickle=False, losses=losses, floor=floor)
         counted = {
-            "antennas": found.antennas,
+            "antennas": found["antennas"],
             "max_steps": self.max_steps,
-            "steps_to": {excess: found.steps_to(float(excess)) for excess in EXCESSES},
-            "best": float(found.losses.min() / found.floor - 1),
+            "steps_to": {excess: steps_to(losses, floor, float(excess)) for excess in EXCESSES},
+            "best": float(losses.min() / floor - 1),
         }
         write_json(output / DESCENT, counted)
         return counted
 
     def _cost(self) -> Cost:
-        return Cost(
-            20 + ADAMAX_STEP * self.work * self.max_steps,
-            self.memory,
-            1e6,
-        )
+        return Cost(20 + ADAMAX_STEP * self.work * self.max_steps, self.memory, 1e6)
 
 
 class RunTimes(Task, stage="runtime", version=2, cost=Cost(1, disk=1e5)):
@@ -289,10 +226,7 @@ RUN_TIME = "run_time"
 
 @dataclass(frozen=True)
 class RunTimeTable:
-    """One run-time study: the name of the run with the machine, and its table.
-
-    The table has ``cases``, one per array and device, and ``descent``.
-    """
+    """One run-time study: the name of the run with the machine, and its table, with ``cases`` and ``descent``."""
 
     name: str
     table: Mapping[str, Any]
@@ -311,10 +245,7 @@ class RunTimeTable:
         return sorted(found, key=lambda case: case["size"])
 
     def medians(self, panel: str, kind: str, device: str = "cpu") -> np.ndarray:
-        """Return the median seconds of a kind of step or solve for each array, (Nsizes,).
-
-        The panel is "rows" or "line", the device "cpu" or "gpu".
-        """
+        """Return the median seconds of a kind of step or solve for each array of "rows" or "line", (Nsizes,)."""
         return np.array([case["seconds"][kind]["median"] for case in self.cases(panel, device)])
 
     def column(self, panel: str, name: str, device: str = "cpu") -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,10 +86,7 @@ class ScoreTable(StudyTable):
 
 
 class MeasureScore(Task, stage="score", version=6):
-    """The scores in bins and in bands of k, and other numbers by which calibrators are compared.
-
-    Errors of gains and chi^2 are of all polarizations since version 6.
-    """
+    """The scores in bins and in bands of k, and other numbers by which calibrators are compared."""
 
     power: PowerSettings
     polarizations: int
@@ -134,9 +132,8 @@ class MeasureScore(Task, stage="score", version=6):
 
     def _sky_model_error(self) -> float | None:
         """Return the rms of the sky model's error over that of the true foregrounds; zero for a perfect sky model."""
-        if self.sky_model_error is None:
-            return 0.0
-        return read_json(self.sky_model_error / SKY_MODEL_ERROR)["relative_error"]
+        folder = self.sky_model_error
+        return 0.0 if folder is None else read_json(folder / SKY_MODEL_ERROR)["relative_error"]
 
     def _gain_errors(self) -> dict[str, float | None]:
         """Return the median relative errors of the gains, as fitted and after alignment of the degenerate terms."""
@@ -190,14 +187,12 @@ class MeasureScore(Task, stage="score", version=6):
             for parity in PARITIES
             for record in read_json(calibrations[parity] / SOLUTION)["records"]
         ]
-        statuses = [record["status"] for record in records]
-        by_status = {status: statuses.count(status) for status in sorted(set(statuses))}
-        if set(statuses) == {"by-file"}:
-            return {"by_status": by_status, "cpu_seconds_per_integration": None, "peak_memory": None}
+        by_status = dict(sorted(Counter(record["status"] for record in records).items()))
+        known = set(by_status) != {"by-file"}
         return {
             "by_status": by_status,
-            "cpu_seconds_per_integration": cpu_seconds_per_integration(records),
-            "peak_memory": max(record["peak_memory"] for record in records),
+            "cpu_seconds_per_integration": cpu_seconds_per_integration(records) if known else None,
+            "peak_memory": max(record["peak_memory"] for record in records) if known else None,
         }
 
     def _cost(self) -> Cost:

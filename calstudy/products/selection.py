@@ -76,10 +76,7 @@ def true_of(true: Path | None, fitted: Gains, polarization: int = 0) -> np.ndarr
 
 
 def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGains:
-    """Read true and fitted gains, and align the fit with the truth.
-
-    Raises InputError if this integration has no solution.
-    """
+    """Read true and fitted gains, and align the fit with the truth; raises InputError without a solution."""
     truth, fit = read_gains(true), read_gains(fitted)
     used = ~fit.flags[integration]
     if not used.any():
@@ -91,10 +88,7 @@ def read_aligned_gains(true: Path, fitted: Path, integration: int) -> AlignedGai
 
 
 def read_spectra(path: Path, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Read baselines (a, b) of a UVH5 product in Jy, complex, (len(pairs), Ntimes, Nfreqs).
-
-    The antenna numbers must have the order of the product.
-    """
+    """Read baselines (a, b), in the order of the product, in Jy, complex, (len(pairs), Ntimes, Nfreqs)."""
     return _of_pairs(path, pairs, to_cube)
 
 

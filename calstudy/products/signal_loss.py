@@ -19,7 +19,7 @@ from calstudy.power.binned import make_bin_edges
 from calstudy.power.delay import make_taper
 from calstudy.power.score import SPECTRA, CalibratedSpectra
 from calstudy.power.score import score as measure
-from calstudy.power.spectra import SphericalSpectrum, of_common_units
+from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.tables import TRANSFER_COLUMNS, load_spectrum, save_spectrum, write_columns, write_csv
 from calstudy.power.transfer import (
     BANDS,
@@ -34,6 +34,7 @@ from calstudy.power.transfer import (
     where_measured,
 )
 from calstudy.products import calibration, corruption, spectra
+from calstudy.products.calibration import in_words
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     AVERAGE,
@@ -140,13 +141,7 @@ class Difference(Task, stage="difference", version=2):
 
 def read_calibrated(folders: Mapping[str, Path]) -> CalibratedSpectra:
     """Read the delay spectra of a calibration, in common units, from the folders of each."""
-    delays = {name: spectra.read_delay_spectra(folders[name]) for name in SPECTRA}
-    return CalibratedSpectra(**of_common_units(delays))
-
-
-def statuses(summary: Mapping[str, Any]) -> str:
-    """Count the solves by status in words, from the content of score.json."""
-    return ", ".join(f"{count} {status}" for status, count in summary["by_status"].items())
+    return CalibratedSpectra(**spectra.read_common(folders))
 
 
 class Injected(Task):
@@ -160,9 +155,7 @@ class Injected(Task):
 
     def read(self) -> Injection:
         """Read the delay spectra, in common units."""
-        folders = {"signal": self.signal, "response": self.response, "cross": self.cross}
-        delays = {name: spectra.read_delay_spectra(folder) for name, folder in folders.items()}
-        return Injection(**of_common_units(delays))
+        return Injection(**spectra.read_common({name: getattr(self, name) for name in ("signal", "response", "cross")}))
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return T and the squared coherence in bands of k."""
@@ -183,10 +176,7 @@ class Injected(Task):
 
 
 class Transfer(Injected, stage="transfer", version=7, cost=Cost(1, disk=1e6)):
-    """T per k outside and inside the wedge and per (|b|, tau).
-
-    Equal lengths |b| share a bin since version 5; errors of P^R / T are not those of P^R over T since 7.
-    """
+    """T per k outside and inside the wedge and per (|b|, tau)."""
 
     scale: Input
 
@@ -244,7 +234,7 @@ class SweepSummary(Task, stage="sweep-summary", version=2):
         """Write summary.csv: a row for each point, region and band of k; the bias is that outside the wedge."""
         rows: list[dict[str, Any]] = []
         for label, point in self.points.items():
-            solves = statuses(read_json(self.measured[f"{label}:score"] / SCORE))
+            solves = in_words(read_json(self.measured[f"{label}:score"] / SCORE)["by_status"])
             for region, inside in REGIONS.items():
                 path = self.measured[label] / spectrum_file(TRANSFER_BANDS, region)
                 found = load_spectrum(path, TransferFunction)
@@ -285,10 +275,7 @@ class SweepSummary(Task, stage="sweep-summary", version=2):
 
 
 class FluxScale(Task, stage="flux-scale", version=1):
-    """The flux scale of a calibration, of all polarizations, as are the spectra that it multiplies.
-
-    Several used to have the scale of the first; their number, which is in the key unless it is one, tells them apart.
-    """
+    """The flux scale of a calibration, of all polarizations, as are the spectra that it multiplies."""
 
     taper: str
     polarizations: int = 1

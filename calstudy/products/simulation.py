@@ -64,10 +64,7 @@ def foregrounds(graph: Graph) -> Task | None:
 
 
 def foregrounds_of(graph: Graph, label: str, sky: SkySettings, instrument: InstrumentSettings) -> Task | None:
-    """Return the task of the foregrounds of any sky through any instrument, or None if the sky has none.
-
-    The section `simulation` is that of the graph's experiment.
-    """
+    """Return the task of the foregrounds of any sky through any instrument, or None if the sky has none."""
     if not sky.has_foregrounds:
         return None
     diffuse = None if sky.diffuse.kind == "none" else sky.diffuse

@@ -24,10 +24,7 @@ from calstudy.run.task import Input, Task
 
 @memoize
 def sky_model(graph: Graph) -> Task | None:
-    """Return the task of the visibilities of the calibrator's sky model, or None if there is none.
-
-    If the experiment assumes nothing else, it is the task of the true foregrounds.
-    """
+    """Return the task of the calibrator's sky model, the true foregrounds if nothing else is assumed; None for none."""
     changes = assumed_changes(graph.experiment.calibration.assumed)
     if SKY_MODEL in changes:
         path = Path(changes[SKY_MODEL])
@@ -60,14 +57,10 @@ def differences(graph: Graph) -> list[tuple[str, str, str]]:
         return [(SKY_MODEL, "the true foregrounds", str(changes[SKY_MODEL]))]
     world = assumed_world(experiment)
     true = AssumedWorld(sky=experiment.sky, instrument=experiment.instrument)
-    before, after = (_without_errors(found.model_dump(mode="json")) for found in (true, world))
+    # Deviations of antennas from the nominal ones have a row of their own.
+    before, after = (found.model_dump(mode="json", exclude={"instrument": {"as_built"}}) for found in (true, world))
     rows = [(path, _text(value), _text(other)) for path, value, other in paths.differences(before, after)]
     return [*rows, *_differences_as_built(experiment)]
-
-
-def _without_errors(world: dict[str, Any]) -> dict[str, Any]:
-    """Return a world without the deviations of its antennas from the nominal ones, which have a row of their own."""
-    return {**world, "instrument": {key: value for key, value in world["instrument"].items() if key != "as_built"}}
 
 
 def _differences_as_built(experiment: Experiment) -> list[tuple[str, str, str]]:
@@ -108,7 +101,7 @@ class SkyModelTable(StudyTable):
 
 
 class ReadSkyModel(Task, stage="sky-model", version=2):
-    """The visibilities of a file, at the samples of the data; of feeds by their directions since version 2."""
+    """The visibilities of a file, at the samples of the data, of feeds by their directions."""
 
     path: Path
     instrument: InstrumentSettings

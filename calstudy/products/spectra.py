@@ -14,7 +14,7 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.experiment.model import Component, Variant
 from calstudy.power.binned import cylindrical_average, noise_level, spherical_average, with_errors
 from calstudy.power.interface import estimate_spectra, polarizations_without_data
-from calstudy.power.spectra import DelaySpectra, SphericalSpectrum
+from calstudy.power.spectra import DelaySpectra, SphericalSpectrum, of_common_units
 from calstudy.power.tables import load_spectrum, save_spectrum, write_csv
 from calstudy.products import calibration, corruption
 from calstudy.products.corruption import PARITIES
@@ -148,7 +148,7 @@ class Average(InBlocks, stage="average", version=2):
 
 
 class Power(Task, stage="power", version=5):
-    """The delay power spectra of two averages, and since version 5 how much noise missing samples add."""
+    """The delay power spectra of two averages, and how much noise missing samples add."""
 
     beam: Beam
     channels: Channels
@@ -157,10 +157,7 @@ class Power(Task, stage="power", version=5):
     odd: Input
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the delay spectra even x odd to delay-spectra.h5, and the files of the estimator itself.
-
-        Spectra are NaN if all data are flagged because no solve gave gains.
-        """
+        """Write the delay spectra even x odd, NaN if all data are flagged, and the files of the estimator itself."""
         from calstudy.instrument.beams import make_beam
 
         even, odd = averages = [read_visibilities(folder / AVERAGE) for folder in (self.even, self.odd)]
@@ -210,6 +207,11 @@ def read_delay_spectra(folder: Path) -> DelaySpectra:
     return load_spectrum(folder / DELAY_SPECTRA, DelaySpectra)
 
 
+def read_common(folders: Mapping[str, Path]) -> dict[str, DelaySpectra]:
+    """Read products of the stage `power`, by name, in the units that all have."""
+    return of_common_units({name: read_delay_spectra(folder) for name, folder in folders.items()})
+
+
 def read_recovered(folder: Path) -> list[SphericalSpectrum]:
     """Read P^R and P^S outside the wedge from a product of the stage `spectra`."""
     files = (folder / spectrum_file(name, "outside-wedge") for name in ("residual", "eor"))
@@ -220,8 +222,7 @@ class Spectra(Task, stage="spectra", version=5):
     """Wedge and spherical spectra of all variants, with errors.
 
     The noise part of the errors comes from spectra of the noise alone, the sample variance from those of the EoR alone
-    (paper section Reduction of Simulation Products); each enters the variants that contain its component. Equal lengths
-    share a bin of the wedge since version 4; integrations that were not solved are not averaged noise since 5.
+    (paper section Reduction of Simulation Products); each enters the variants that contain its component.
     """
 
     power: PowerSettings

@@ -7,23 +7,20 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from calstudy.base.resources import Usage, resident_memory
 from calstudy.base.tensorflow import tf
 from calstudy.calibrate.problem import CalibrationProblem, FitStructure
-from calstudy.calibrate.settings import BasisSettings
 from calstudy.calibrate.solvers.adamax import STEPS_PER_CALL, Adamax
 from calstudy.calibrate.solvers.gauss_newton import GaussNewton
 from calstudy.calibrate.solvers.interface import solve
 from calstudy.calibrate.synthetic import Case, Simulation
 from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Channels, Layout
-from calstudy.products.run_times import Descent, Samples, StepTimes
+from calstudy.products.run_times import TimedArray
 
 ROUNDS = 10
 """Number of rounds in which the samples of all solvers are taken, so that other load affects all of them equally."""
@@ -116,13 +113,20 @@ def make_simulation(layout: Layout, channels: Channels) -> Simulation:
     return Simulation(case, positions)
 
 
-def time_steps(layout: Layout, channels: Channels, basis: BasisSettings, samples: Samples, device: str) -> StepTimes:
-    """Time all solvers on one array, in this process; see `time_steps_apart`."""
+def time_steps(array: TimedArray, samples: Mapping[str, int], device: str) -> dict[str, Any]:
+    """Time all solvers on one array, on ``cpu`` (one core) or ``gpu``, in this process.
+
+    There are so many samples of ``steps`` of the paper's solver, of ``calls`` of our Adamax, each the mean of its
+    `STEPS_PER_CALL` steps, and of complete, cold ``solves`` of the default solver, each with its own noise. The answer
+    has ``longest`` in m; the foreground ``vectors`` of the longest baseline, to which the paper pads all others, and
+    ``coefficients`` of all together; samples in ``seconds`` by name, of processor time or, on a GPU, elapsed time; and
+    the bytes by which the paper's steps raised the memory of the process (``paper_memory``).
+    """
     # Other work on the machine does not stretch processor time.
     clock = time.process_time if device == "cpu" else time.perf_counter
     with tf.device(f"/{device.upper()}:0"):
-        simulation = make_simulation(layout, channels)
-        structure = simulation.structure(basis)
+        simulation = make_simulation(array.layout, array.channels)
+        structure = simulation.structure(array.basis)
         problem = simulation.problem(0, structure)
         before = resident_memory()
         with Usage() as usage:
@@ -133,16 +137,16 @@ def time_steps(layout: Layout, channels: Channels, basis: BasisSettings, samples
             seconds.setdefault(name, []).append(sample)
     first, second = structure.antennas.T
     lengths = np.linalg.norm(simulation.positions[second] - simulation.positions[first], axis=1)
-    return StepTimes(
-        antennas=structure.n_antennas,
-        baselines=structure.n_baselines,
-        longest=float(lengths.max()),
-        vectors=max(bucket.vectors.shape[1] for bucket in structure.basis.buckets),
-        coefficients=structure.basis.n_coefficients,
-        seconds=seconds,
-        basis_bytes=paper.basis_bytes,
-        paper_memory=usage.peak_memory - before,
-    )
+    return {
+        "antennas": structure.n_antennas,
+        "baselines": structure.n_baselines,
+        "longest": float(lengths.max()),
+        "vectors": max(bucket.vectors.shape[1] for bucket in structure.basis.buckets),
+        "coefficients": structure.basis.n_coefficients,
+        "seconds": seconds,
+        "basis_bytes": paper.basis_bytes,
+        "paper_memory": usage.peak_memory - before,
+    }
 
 
 def _settle(call: Callable[[], object]) -> None:
@@ -155,7 +159,7 @@ def _settle(call: Callable[[], object]) -> None:
 
 
 def _all_samples(
-    simulation: Simulation, structure: FitStructure, paper: PaperStep, samples: Samples, clock: Clock
+    simulation: Simulation, structure: FitStructure, paper: PaperStep, samples: Mapping[str, int], clock: Clock
 ) -> Iterator[tuple[str, float]]:
     """Yield samples by name, without compilation, in rounds that contain all kinds."""
     problem = simulation.problem(0, structure)
@@ -165,15 +169,15 @@ def _all_samples(
     for call in (paper.model_sum, lambda: adamax.step(state), lambda: solve(problem, solver)):
         call()
     for number in range(ROUNDS):
-        for _ in range(_share(samples.steps, number)):
+        for _ in range(_share(samples["steps"], number)):
             # Reading the loss waits for a GPU, which returns before it has finished.
             yield "paper-step", _seconds(lambda: float(paper.step()), clock)
             yield "paper-sum", _seconds(lambda: [part.numpy() for part in paper.model_sum()], clock)
-        for _ in range(_share(samples.calls, number)):
+        for _ in range(_share(samples["calls"], number)):
             # Every call starts from the same state.
             yield "adamax-step", _seconds(lambda: adamax.step(state), clock) / STEPS_PER_CALL
-        for index in range(_share(samples.solves, number)):
-            realization = 1 + number * samples.solves + index
+        for index in range(_share(samples["solves"], number)):
+            realization = 1 + number * samples["solves"] + index
             yield from _solve_in_steps(simulation.problem(0, structure, realization), solver, clock)
 
 
@@ -199,27 +203,25 @@ def _solve_in_steps(problem: CalibrationProblem, solver: GaussNewton, clock: Clo
     yield "default-solve", clock() - start
 
 
-def descend(layout: Layout, channels: Channels, basis: BasisSettings, max_steps: int) -> Descent:
-    """Run the paper's solver, Adamax at a fixed rate of 0.01 from unity, for all of `max_steps`."""
-    simulation = make_simulation(layout, channels)
-    structure = simulation.structure(basis)
+def descend(array: TimedArray, max_steps: int) -> dict[str, Any]:
+    """Run the paper's solver, Adamax at a fixed rate of 0.01 from unity, for all of `max_steps`.
+
+    The answer has the minimum of the loss (``floor``), and the ``losses`` before the first step and after each.
+    """
+    simulation = make_simulation(array.layout, array.channels)
+    structure = simulation.structure(array.basis)
     problem = simulation.problem(0, structure)
     floor = min(solve(problem, GaussNewton(FLOOR_TOLERANCE, FLOOR_STEPS)).record.loss_history)
     history = solve(problem, Adamax(max_steps=max_steps, tolerance=0.0)).record.loss_history
-    return Descent(structure.n_antennas, float(floor), history)
+    return {"antennas": structure.n_antennas, "floor": float(floor), "losses": history.tolist()}
 
 
-def _answer(request: Mapping[str, Any]) -> dict[str, Any]:
-    array = request["array"]
-    layout = TypeAdapter(Layout).validate_python(array["layout"])
-    channels = Channels.model_validate(array["channels"])
-    basis = BasisSettings.model_validate(array["basis"])
-    if "max_steps" in request:
-        found = asdict(descend(layout, channels, basis, request["max_steps"]))
-        return {**found, "losses": found["losses"].tolist()}
-    return asdict(time_steps(layout, channels, basis, Samples(**request["samples"]), request["device"]))
+def answer(array: Mapping[str, Any], **request: Any) -> dict[str, Any]:
+    """Return what `run_times.measured_apart` asks for: times, or with ``max_steps`` a descent."""
+    measure = descend if "max_steps" in request else time_steps
+    return measure(TimedArray.model_validate(array), **request)
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    print(json.dumps(_answer(json.loads(sys.argv[1]))))
+    print(json.dumps(answer(**json.loads(sys.argv[1]))))

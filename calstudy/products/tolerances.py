@@ -98,18 +98,12 @@ def tolerance(severities: Sequence[float], bias: np.ndarray, error: np.ndarray) 
     reached = [place for place in used if abs(bias[place]) >= LIMIT and abs(bias[place]) >= SIGMAS * error[place]]
     # An error that is not known is unclear too.
     unclear = [place for place in used if place not in reached and not upper_limit(bias[place], error[place]) <= LIMIT]
-    if not used:
-        return Tolerance(math.nan, "?")
-    if unclear and (not reached or unclear[0] < reached[0]):
-        if not reached:
-            return Tolerance(math.nan, "?")
-        return Tolerance(float(severities[reached[0]]), "<")
     if not reached:
-        return Tolerance(float(severities[used[-1]]), ">")
-    place = used.index(reached[0])
-    if place == 0:
-        return Tolerance(float(severities[used[0]]), "<")
-    low, high = used[place - 1], used[place]
+        return Tolerance(math.nan, "?") if unclear or not used else Tolerance(float(severities[used[-1]]), ">")
+    high = reached[0]
+    if min([*unclear, high]) < high or high == used[0]:
+        return Tolerance(float(severities[high]), "<")
+    low = used[used.index(high) - 1]
     below = max(abs(bias[low]), SIGMAS * error[low], np.finfo(float).tiny)
     part = math.log(LIMIT / below) / math.log(abs(bias[high]) / below)
     return Tolerance(float(severities[low] * (severities[high] / severities[low]) ** part), "=")

@@ -15,7 +15,7 @@ from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.settings import PowerSettings
 from calstudy.power.tables import save_spectrum
-from calstudy.power.windows import BinSignals, UnbiasedSpectrum, deconvolved, window_matrix
+from calstudy.power.windows import UnbiasedSpectrum, deconvolved, draw_in_bins, window_matrix
 from calstudy.products import corruption, signal_loss
 from calstudy.products.expected_loss import (
     NOT_OF_THE_FIT,
@@ -65,17 +65,14 @@ def unbiased(graph: Graph) -> Task:
 
 
 class BinResponse(Responses, stage="bin-response", version=2):
-    """The linear response of one calibrated integration to random signals of each bin of k.
-
-    Since version 2 baselines without weight have one, where the foregrounds are the sky model.
-    """
+    """The linear response of one calibrated integration to random signals of each bin of k."""
 
     def amplitudes(self, solution: Solution, modes: DelayModes) -> dict[str, np.ndarray]:
         """Return the amplitudes of what is left of the signals, and the power of these."""
         groups, rng = redundant_groups(solution.vectors, REDUNDANT), np.random.default_rng(SEED)
-        where = solution.frequency, solution.lengths, groups.index, groups.conjugated
-        signals = BinSignals(*where, window_edges(self.power), self.power.cosmology)
-        drawn = [[solution.used * signal for signal in signals.draw(rng)] for _ in range(DRAWS)]
+        where = solution.frequency, solution.lengths, (groups.index, groups.conjugated), window_edges(self.power)
+        signals = (draw_in_bins(*where, self.power.cosmology, rng) for _ in range(DRAWS))
+        drawn = [[solution.used * signal for signal in parts] for parts in signals]
         left = [[modes.amplitudes(solution.left_of(signal)) for signal in parts] for parts in drawn]
         powers = [np.abs(modes.amplitudes(signal)) ** 2 for parts in drawn for signal in parts]
         return {"left": np.array(left, np.complex64), "put_in": np.sum(powers, axis=0) / DRAWS}

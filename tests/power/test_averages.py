@@ -23,6 +23,7 @@ from calstudy.power.spectra import (
     DelaySpectra,
     SphericalSpectrum,
     delay_spectra,
+    length_bins,
     of_common_units,
     outside_wedge,
 )
@@ -166,8 +167,7 @@ def test_averages_of_a_constant_are_that_constant(n_units, n_delays, seed, buffe
             np.hypot(spectra.k_perp[:, None], spectra.k_parallel) <= everything.bin_edges[-1]
         ].sum()
     )
-    for folded in (True, False):
-        np.testing.assert_allclose(cylindrical_average(spectra, settings, folded).power, 3.0 - 2.0j)
+    np.testing.assert_allclose(cylindrical_average(spectra, settings).power, 3.0 - 2.0j)
 
 
 def test_the_wedge_mask_is_the_horizon_plus_the_buffer():
@@ -194,18 +194,21 @@ def test_folding_averages_opposite_delays(n_delays):
     rng = np.random.default_rng(1)
     power = rng.normal(size=(6, n_delays)) + 1j * rng.normal(size=(6, n_delays))
     spectra = make_spectra(power, rng.normal(size=(6, 3)) * 20)
-    flat, folded = (cylindrical_average(spectra, SETTINGS, f) for f in (False, True))
+    folded = cylindrical_average(spectra, SETTINGS)
+    edges, row = length_bins(spectra.length, SETTINGS.length_bin)
+    flat = np.array([power[row == number].mean(axis=0) for number in range(len(edges))])
+    np.testing.assert_array_equal(folded.bin_edges, edges)
     assert folded.delay[0] == 0
     assert folded.k_parallel[0] == 0
     zero = n_delays // 2
-    np.testing.assert_allclose(folded.power[:, 0], flat.power[:, zero])
-    np.testing.assert_allclose(folded.power[:, 3], (flat.power[:, zero + 3] + flat.power[:, zero - 3]) / 2)
-    np.testing.assert_allclose(folded.delay[3], flat.delay[zero + 3])
+    np.testing.assert_allclose(folded.power[:, 0], flat[:, zero])
+    np.testing.assert_allclose(folded.power[:, 3], (flat[:, zero + 3] + flat[:, zero - 3]) / 2)
+    np.testing.assert_allclose(folded.delay[3], spectra.delay[zero + 3])
     if n_delays % 2 == 0:
-        np.testing.assert_allclose(folded.power[:, -1], flat.power[:, 0])
-    assert (np.diff(flat.baseline_length) > 0).all()
-    assert ((flat.bin_edges[:, 0] <= flat.baseline_length) & (flat.baseline_length < flat.bin_edges[:, 1])).all()
-    np.testing.assert_allclose(flat.horizon_delay, flat.baseline_length / constants.c.value)
+        np.testing.assert_allclose(folded.power[:, -1], flat[:, 0])
+    assert (np.diff(folded.baseline_length) > 0).all()
+    assert ((edges[:, 0] <= folded.baseline_length) & (folded.baseline_length < edges[:, 1])).all()
+    np.testing.assert_allclose(folded.horizon_delay, folded.baseline_length / constants.c.value)
 
 
 @pytest.mark.parametrize("taper", ["blackman-harris", "none"])
@@ -325,17 +328,10 @@ def test_polarizations_share_the_signal_not_the_noise():
     spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
     two = dataclasses.replace(spectra, n_polarizations=2)
     bins = np.zeros((3, 16), dtype=int)
-    np.testing.assert_allclose(binned.noise_modes(two, bins, 1), 2 * binned.noise_modes(spectra, bins, 1))
+    np.testing.assert_allclose(
+        binned.product_modes(two, bins, 1, two.n_pairs), 2 * binned.product_modes(spectra, bins, 1, spectra.n_pairs)
+    )
     np.testing.assert_allclose(binned.sample_modes(two, bins, 1), binned.sample_modes(spectra, bins, 1))
-
-
-def test_errors_need_the_same_bins():
-    spectra = make_spectra(np.ones((3, 16), dtype=complex), np.eye(3) * 40)
-    first = spherical_average(spectra, SETTINGS, False)
-    other = spherical_average(spectra, PowerSettings(), False)
-    assert np.isnan(first.error).all()
-    with pytest.raises(ValueError, match="other bins"):
-        binned.with_errors(first, signal=other)
 
 
 def test_noise_power_from_visibilities_has_its_known_level(observe, white, beam):

@@ -183,19 +183,16 @@ def test_flux_conventions():
     np.testing.assert_allclose(kelvin * jansky, 1.0, rtol=1e-12)
     for convention in (None, "sum"):
         np.testing.assert_allclose(kelvin_per_jansky(frequencies, omega, convention), 2 * kelvin)
-    with pytest.raises(ValueError, match="'median' is unknown, allowed"):
-        kelvin_per_jansky(frequencies, omega, "median")
 
 
 def test_redundant_pairs_are_all_others_of_the_group_and_point_alike(observe):
     template = observe(HexLayout(kind="hex", side=3), n_channels=8)
     pairs = make_pairs(template, PowerSettings())
-    assert pairs.redundant
     vectors = {}
     for (a, b), vector in zip(antenna_pairs(template).tolist(), baseline_vectors(template), strict=True):
         vectors[a, b], vectors[b, a] = vector, -vector
     groups = {}
-    for first, second in zip(pairs.first, pairs.second, strict=True):
+    for first, second in pairs:
         assert first not in (second, second[::-1])
         np.testing.assert_allclose(vectors[first], vectors[second], atol=0.1)
         groups.setdefault(tuple(np.rint(vectors[first] * 2).astype(int)), set()).add((first, second))
@@ -211,12 +208,12 @@ def test_redundant_pairs_are_all_others_of_the_group_and_point_alike(observe):
 
 def test_choice_of_pairs(observe):
     random = observe(MwaLayout(kind="mwa-compact-minredundant", count=12), n_channels=8)
-    assert not make_pairs(random, PowerSettings()).redundant
+    assert all(first == second for first, second in make_pairs(random, PowerSettings()))
     golomb = observe(GOLOMB, n_channels=8)
     with pytest.raises(ValueError, match="allowed for this array: 'same-baseline'"):
         make_pairs(golomb, PowerSettings(pairs="redundant-group"))
     hexagon = observe(HexLayout(kind="hex", side=2), n_channels=8)
-    assert len(make_pairs(hexagon, PowerSettings(pairs="same-baseline")).first) == hexagon.Nbls
+    assert len(make_pairs(hexagon, PowerSettings(pairs="same-baseline"))) == hexagon.Nbls
 
 
 def test_reversed_baselines_of_a_group_are_conjugated(observe, beam):
@@ -291,8 +288,7 @@ def test_a_baseline_without_odd_data_is_crossed_by_its_even_data_alone(observe, 
     even, odd = two(observe(HexLayout(kind="hex", side=2), n_channels=8), white)
     settings = PowerSettings(pairs="redundant-group")
     pairs = make_pairs(even, settings)
-    whole = set(zip(pairs.first, pairs.second, strict=True))
-    lost = pairs.first[0]
+    whole, lost = set(pairs), pairs[0][0]
     odd.flag_array[(antenna_pairs(odd) == sorted(lost)).all(axis=1)] = True
     found = estimate_power(even, odd, beam, settings)
     kept = set(found.get_blpairs())
@@ -310,10 +306,6 @@ def test_bad_data_are_refused(observe, white, beam):
     kelvin.vis_units = "K str"
     with pytest.raises(ValueError, match=r"odd data are in 'K str', expected 'Jy'"):
         estimate_power(even, kelvin, beam, PowerSettings())
-    numbers = even.copy()
-    numbers.ant_2_array = numbers.ant_2_array + 900
-    with pytest.raises(ValueError, match=r"antenna number 904 is too large .* 0 to 899"):
-        make_pairs(numbers, PowerSettings())
     fewer = white(observe(GOLOMB, n_channels=16), np.random.default_rng(0))
     with pytest.raises(ValueError, match="differ in freq_array"):
         estimate_power(even, fewer, beam, PowerSettings())

@@ -306,10 +306,6 @@ def test_two_realizations_are_too_few_to_correct(random):
     assert set(corrected.reasons) == {"too few realizations for an error of T"}
 
 
-def test_bins_that_differ_are_refused(random):
-    first, second = draw(EVERYTHING, random)[:2]
-    other = replace(second.eor, bin_edges=second.eor.bin_edges + 0.01)
-    with pytest.raises(ValueError, match="different bins"):
-        pool_region([first, replace(second, eor=other)], EVERYTHING)
+def test_a_single_realization_is_not_pooled():
     with pytest.raises(ValueError, match="at least two"):
         pool(np.ones((1, 3)), np.ones((1, 3)))

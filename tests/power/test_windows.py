@@ -6,7 +6,7 @@ import pytest
 from calstudy.calibrate.expected_loss import DelayModes
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
 from calstudy.power.spectra import BaselineModes
-from calstudy.power.windows import BinSignals, deconvolved, window_matrix
+from calstudy.power.windows import deconvolved, draw_in_bins, window_matrix
 
 FREQUENCY = 167.075e6 + 160e3 * np.arange(96)
 LENGTHS = np.linspace(10, 60, 40)
@@ -16,8 +16,8 @@ COSMOLOGY = "Planck15"
 GROUPS = np.arange(LENGTHS.size), np.zeros(LENGTHS.size, bool)
 
 
-def signals(groups=GROUPS):
-    return BinSignals(FREQUENCY, LENGTHS, *groups, EDGES, COSMOLOGY)
+def draw(rng, lengths=LENGTHS, groups=GROUPS):
+    return list(draw_in_bins(FREQUENCY, lengths, groups, EDGES, COSMOLOGY, rng))
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def where(modes):
 
 def windows(modes, where, keep, draws=40):
     """W of a calibration that leaves `keep` of a signal, a function of (Nbls, Nfreqs)."""
-    rng, drawn = np.random.default_rng(1), signals()
-    parts = [list(drawn.draw(rng)) for _ in range(draws)]
+    rng = np.random.default_rng(1)
+    parts = [draw(rng) for _ in range(draws)]
     left = np.array([[modes.amplitudes(keep(one)) for one in found] for found in parts])
     put_in = np.sum(np.abs([modes.amplitudes(one) for found in parts for one in found]) ** 2, axis=0) / draws
     return window_matrix(where, (left, left), put_in, EDGES, BUFFER)
@@ -50,7 +50,7 @@ def delay_filter(modes, factor):
 
 
 def test_signals_of_all_bins_are_white_with_a_mean_square_of_one():
-    power = [np.abs(np.sum(list(signals().draw(np.random.default_rng(seed))), axis=0)) ** 2 for seed in range(20)]
+    power = [np.abs(np.sum(draw(np.random.default_rng(seed)), axis=0)) ** 2 for seed in range(20)]
     # Of 20 draws of 40 baselines and 96 channels, and of each channel.
     assert np.mean(power) == pytest.approx(1, abs=4 / np.sqrt(20 * 40 * 96))
     assert np.mean(power, axis=(0, 1)) == pytest.approx(1, abs=4.5 / np.sqrt(20 * 40))
@@ -69,7 +69,7 @@ def test_without_loss_windows_add_up_to_one(modes, where):
 def test_signals_have_power_in_their_bin_alone(modes, where):
     rng = np.random.default_rng(2)
     k = np.hypot(where.k_perp[:, None], where.k_parallel)
-    for number, signal in enumerate(signals().draw(rng)):
+    for number, signal in enumerate(draw(rng)):
         power = np.abs(modes.amplitudes(signal)) ** 2
         # The taper's main lobe reaches three delays to either side.
         reach = 3 * np.diff(where.k_parallel).mean()
@@ -80,8 +80,7 @@ def test_signals_have_power_in_their_bin_alone(modes, where):
 def test_redundant_baselines_see_one_signal_and_reversed_ones_its_conjugate():
     groups, reversed_ones = np.repeat(np.arange(20), 2), np.tile([False, True], 20)
     lengths = np.repeat(LENGTHS[:20], 2)
-    drawn = BinSignals(FREQUENCY, lengths, groups, reversed_ones, EDGES, COSMOLOGY)
-    for signal in drawn.draw(np.random.default_rng(3)):
+    for signal in draw(np.random.default_rng(3), lengths, (groups, reversed_ones)):
         assert np.allclose(signal[1::2], signal[::2].conj())
 
 
@@ -95,7 +94,7 @@ def test_a_steep_spectrum_comes_back_where_a_flat_transfer_function_misses_it(mo
     white = np.full((LENGTHS.size, modes.delay.size), np.sum(modes.weights**2))
     rng, total, draws = np.random.default_rng(5), np.zeros(6), 60
     for _ in range(draws):
-        parts = [np.sqrt(power) * one for power, one in zip(truth, signals().draw(rng), strict=True)]
+        parts = [np.sqrt(power) * one for power, one in zip(truth, draw(rng), strict=True)]
         left = modes.amplitudes(keep(np.sum(parts, axis=0)))[None, None]
         ones = np.repeat(left, 6, axis=1)
         total += window_matrix(where, (ones, ones), white, EDGES, BUFFER)[:, 0] / draws

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.claims.evaluation import evaluate_folder
-from calstudy.products.run_times import Descent, StepTimes, machine_in_words
+from calstudy.products.run_times import machine_in_words
 from calstudy.studies.kinds import runtime
 from calstudy.studies.kinds.runtime import RuntimeStudy
 from calstudy.studies.load import load_study
@@ -27,26 +27,31 @@ FILE = Path(__file__).parents[2] / "experiments" / "runtime.yaml"
 POWERS = {"paper-step": 2.1, "paper-sum": 2.1, "adamax-step": 1.9, "default-step": 1.5, "default-solve": 1.6}
 
 
-def pretend_to_time(array, samples, device):
-    """Return times that grow with the array by known powers; ten times faster on a GPU."""
-    layout = array["layout"]
-    count = layout["count"]
-    longest = 100.0 if layout["kind"] == "rectangular" else (count - 1) * float(layout["spacing"].split()[0])
-    scatter = np.exp(0.1 * np.linspace(-1, 1, 101)) * (0.1 if device == "gpu" else 1)
-    seconds = {name: (1e-5 * count**power * longest * scatter).tolist() for name, power in POWERS.items()}
+def pretend_to_measure(array, **request):
+    """Return times that grow with the array by known powers, ten times faster on a GPU, or a known descent."""
+    if "max_steps" in request:
+        losses = 1 + 100 / np.arange(1, request["max_steps"] + 2)
+        return {"antennas": 9, "floor": 1.0, "losses": losses.tolist()}
+    layout = array.layout
+    count = layout.count
+    longest = 100.0 if layout.kind == "rectangular" else (count - 1) * layout.spacing
+    scatter = np.exp(0.1 * np.linspace(-1, 1, 101)) * (0.1 if request["device"] == "gpu" else 1)
     basis = int(1e5 * count**2)
-    return StepTimes(count, count * (count - 1) // 2, longest, int(longest), 99, seconds, basis, 6 * basis)
-
-
-def pretend_to_descend(array, max_steps):
-    del array
-    return Descent(9, 1.0, 1 + 100 / np.arange(1, max_steps + 2))
+    return {
+        "antennas": count,
+        "baselines": count * (count - 1) // 2,
+        "longest": longest,
+        "vectors": int(longest),
+        "coefficients": 99,
+        "seconds": {name: (1e-5 * count**power * longest * scatter).tolist() for name, power in POWERS.items()},
+        "basis_bytes": basis,
+        "paper_memory": 6 * basis,
+    }
 
 
 @pytest.fixture
 def study(tmp_path, monkeypatch) -> RuntimeStudy:
-    monkeypatch.setattr("calstudy.products.run_times.time_steps_apart", pretend_to_time)
-    monkeypatch.setattr("calstudy.products.run_times.descend_apart", pretend_to_descend)
+    monkeypatch.setattr("calstudy.products.run_times.measured_apart", pretend_to_measure)
     places = [f"outputs.store={tmp_path / 'store'}", f"outputs.runs={tmp_path / 'runs'}"]
     monkeypatch.setattr(sys.modules[__name__], "PLACES", places)
     return reload()
