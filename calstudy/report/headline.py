@@ -31,20 +31,14 @@ class Number:
 
 @dataclass(frozen=True)
 class Signal:
-    """EoR and other power that is left outside the wedge, in the band of the headline.
-
-    The transfer is the fraction of the EoR's power that is left; the bias is the power of the residual without EoR
-    over that of the EoR. Both are free of the flux scale of the calibrated data, and are the scores of the run, with
-    errors from leaving out antennas.
-    """
+    """The scores of a run in the band of the headline, and T of the linear response of the fit, None if not known."""
 
     transfer: float
     transfer_error: float
     bias: float
     bias_error: float
     scale: float
-    linear_transfer: float | None = None
-    """T of the linear response of the fit, the yardstick for T; None if it is not known."""
+    linear_transfer: float | None
 
     @property
     def numbers(self) -> list[Number]:
@@ -93,14 +87,9 @@ def read_signal(run: RunFolder) -> Signal | None:
     band = int(np.argmin(np.abs(score.bin_edges[:-1] - HEADLINE_BAND[0])))
     bands = run.tables.summary["bands"] if run.tables.has(SCORE) else ()
     linear = next((entry.get("linear_transfer") for entry in bands if entry["k"][0] == score.bin_edges[band]), None)
-    signal = Signal(
-        float(score.transfer[band]),
-        float(score.transfer_error[band]),
-        float(score.bias[band]),
-        float(score.bias_error[band]),
-        score.flux_scale,
-        linear,
-    )
+    columns = (score.transfer, score.transfer_error, score.bias, score.bias_error)
+    transfer, transfer_error, bias, bias_error = (float(column[band]) for column in columns)
+    signal = Signal(transfer, transfer_error, bias, bias_error, score.flux_scale, linear)
     return signal if math.isfinite(signal.transfer) and math.isfinite(signal.bias) else None
 
 

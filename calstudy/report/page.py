@@ -46,21 +46,14 @@ NUMBER = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves over k, or maps over k_perp and k_parallel.
-
-    `data` is the input of the page's script: `kind`, labels and series, ready for JSON.
-    """
+    """Curves over k, or maps over k_perp and k_parallel, as `data` for the page's script, ready for JSON."""
 
     title: str
     data: Mapping[str, Any]
 
 
 def read_charts(path: Path) -> list[Chart]:
-    """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.style`); none for other arrays.
-
-    An entry ``GROUP.FIELD`` is a field of a spectrum: `power` over `k`, a transfer function over `k`, or either over
-    `k_perp` and `k_parallel`. Items of lists, which have numbers for names, are left out.
-    """
+    """Return the charts of the arrays of a figure, ``NAME.npz``; none for other arrays than spectra and T."""
     groups: dict[str, dict[str, np.ndarray]] = {}
     for name, values in arrays_of_figure(path).items():
         group, _, field = name.rpartition(".")
@@ -100,7 +93,7 @@ def _transfer(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
 
 
 def _curves(title: str, label: str, logarithmic: bool, found: Mapping[str, tuple[np.ndarray, ...]]) -> Chart:
-    ordered = [name for name in SERIES if name in found] + [name for name in found if name not in SERIES]
+    ordered = [name for name in dict.fromkeys((*SERIES, *found)) if name in found]
     series = [curve(*SERIES.get(name, (name.replace("_", " "), "grey")), found[name]) for name in ordered]
     return chart_of_curves(title, label, logarithmic, series)
 
@@ -114,9 +107,8 @@ def curve(label: str, colour: str, points: tuple[np.ndarray, ...]) -> dict[str, 
 
 def chart_of_curves(title: str, label: str, logarithmic: bool, series: Sequence[Mapping[str, Any]]) -> Chart:
     """Return a chart over k; `label` is that of the vertical axis."""
-    return Chart(
-        title, {"kind": "curves", "x": "k [h/Mpc]", "y": label, "logarithmic": logarithmic, "series": list(series)}
-    )
+    data = {"kind": "curves", "x": "k [h/Mpc]", "y": label, "logarithmic": logarithmic, "series": list(series)}
+    return Chart(title, data)
 
 
 def _maps(groups: Mapping[str, Mapping[str, np.ndarray]]) -> Chart | None:
@@ -154,15 +146,19 @@ class Picture:
     files: Sequence[str] = ()
     charts: Sequence[Chart] = ()
 
+    @property
+    def image(self) -> str:
+        """The png, encoded for the page."""
+        return base64.b64encode(self.path.read_bytes()).decode("ascii")
+
 
 @dataclass(frozen=True)
 class Contents:
     """All contents of a report.
 
-    Facts are short statements by name, such as the time, the machine and versions. Answers say which calibrators of a
-    comparison pass. Pictures and tables are in the order of the page, below the headline. Files, tables and records,
-    are relative to the run folder. Parts are the run folders of which this one consists: name and relative path of
-    their reports. The experiment is the resolved file, or empty.
+    Facts are short statements by name, such as the time, the machine and versions; answers say which calibrators of a
+    comparison pass. Files, and the reports of parts by name, are relative to the run folder. The experiment is the
+    resolved file, or empty.
     """
 
     title: str
@@ -173,11 +169,11 @@ class Contents:
     warnings: Sequence[str]
     pictures: Sequence[Picture]
     tables: Sequence[Table]
-    headline: Sequence[Number] = ()
-    answers: Sequence[str] = ()
-    files: Sequence[str] = ()
-    parts: Sequence[tuple[str, str]] = ()
-    experiment: str = ""
+    headline: Sequence[Number]
+    answers: Sequence[str]
+    files: Sequence[str]
+    parts: Sequence[tuple[str, str]]
+    experiment: str
 
 
 def read_contents(run: RunFolder) -> Contents:
@@ -196,18 +192,14 @@ def read_contents(run: RunFolder) -> Contents:
         _stages(run.products),
     ]
     signal = read_signal(run)
-    excess = [] if signal is None or signal.excess is None else [signal.excess]
+    excess = [signal.excess] if signal is not None and signal.excess else []
     return Contents(
         title=run.name,
         description=manifest.get("description") or (run.content.get("description", "") if text else ""),
         setup=manifest.get("setup", ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
-        warnings=[
-            *excess,
-            *manifest.get("warnings", []),
-            *recorded_warnings(run.products),
-        ],
+        warnings=[*excess, *manifest.get("warnings", []), *recorded_warnings(run.products)],
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),
@@ -219,15 +211,15 @@ def read_contents(run: RunFolder) -> Contents:
 
 
 def _facts(manifest: Mapping[str, Any]) -> dict[str, str]:
-    facts = {"finished": manifest.get("finished"), "commit": manifest.get("git_commit")}
-    facts["sky model of the calibrator"] = manifest.get("sky_model")
-    machine = manifest.get("machine", {})
-    if machine:
-        facts["machine"] = f"{machine['cores']} cores, {machine['memory_gb']} GB, {machine['system']}"
-    seeds = manifest.get("seeds", {})
-    facts["seeds"] = ", ".join(f"{name} {value}" for name, value in seeds.items())
-    versions = manifest.get("versions", {})
-    facts["versions"] = ", ".join(f"{name} {value}" for name, value in versions.items() if value)
+    machine, versions = manifest.get("machine"), manifest.get("versions", {})
+    facts = {
+        "finished": manifest.get("finished"),
+        "commit": manifest.get("git_commit"),
+        "sky model of the calibrator": manifest.get("sky_model"),
+        "machine": machine and f"{machine['cores']} cores, {machine['memory_gb']} GB, {machine['system']}",
+        "seeds": ", ".join(f"{name} {value}" for name, value in manifest.get("seeds", {}).items()),
+        "versions": ", ".join(f"{name} {value}" for name, value in versions.items() if value),
+    }
     return {name: str(value) for name, value in facts.items() if value}
 
 
@@ -249,8 +241,7 @@ def _pictures(run: RunFolder) -> list[Picture]:
     drawn = [item for item in run.products if item["stage"] == "figure"]
     captions = {item["label"]: item.get("notes", {}).get("caption", "") for item in drawn}
     captions = run.manifest.get("captions", captions)
-    order = [name for name in captions if name in found]
-    order += [name for name in found if name not in captions]
+    order = dict.fromkeys(name for name in (*captions, *found) if name in found)
     return [_picture(name, captions.get(name, ""), found[name]) for name in order]
 
 
@@ -287,33 +278,30 @@ def _claims_table(run: RunFolder) -> Table | None:
 
 
 def _convergence(products: Sequence[Mapping[str, Any]], sky_model: str) -> Table | None:
-    found = [item for item in products if item["stage"] == "calibrate"]
+    found = [(item["label"], item["notes"]) for item in products if item["stage"] == "calibrate"]
     rows = [
         (
-            item["label"],
-            ", ".join(f"{count} {status}" for status, count in item["notes"]["by_status"].items()),
-            f"{item['notes']['median_steps']:g}" if "median_steps" in item["notes"] else "",
-            f"{item['notes']['median_seconds_per_solve']:.2f} s",
+            label,
+            ", ".join(f"{count} {status}" for status, count in notes["by_status"].items()),
+            f"{notes['median_steps']:g}" if "median_steps" in notes else "",
+            f"{notes['median_seconds_per_solve']:.2f} s",
         )
-        for item in found
+        for label, notes in found
     ]
     columns = ("calibration of", "solves", "median steps", "median time per solve")
     return Table(columns, rows, "Solver convergence", sky_model.strip()) if rows else None
 
 
 def _simulation(products: Sequence[Mapping[str, Any]]) -> Table | None:
-    rows = []
-    for item in products:
-        if item["stage"] == "simulate":
-            check = item["notes"].get("interpolation")
-            floors = item["notes"].get("delay_floor", {})
-            rows.append(
-                (
-                    item["label"],
-                    f"{check['max_error']:.1e}" if check else "not interpolated",
-                    ", ".join(f"{floor['worst_db']} dB ({taper})" for taper, floor in floors.items()),
-                )
-            )
+    found = [(item["label"], item["notes"]) for item in products if item["stage"] == "simulate"]
+    rows = [
+        (
+            label,
+            f"{notes['interpolation']['max_error']:.1e}" if notes.get("interpolation") else "not interpolated",
+            ", ".join(f"{floor['worst_db']} dB ({taper})" for taper, floor in notes.get("delay_floor", {}).items()),
+        )
+        for label, notes in found
+    ]
     columns = ("component", "largest interpolation error", "delay floor beyond the horizon")
     note = "Errors relative to the rms; the floor is that of the worst baseline."
     return Table(columns, rows, "Accuracy of the simulation", note) if rows else None
@@ -343,11 +331,6 @@ def _stages(products: Sequence[Mapping[str, Any]]) -> Table | None:
 REPORT = "report.html"
 
 
-def render(contents: Contents) -> str:
-    """Return the page with its pictures, style and script."""
-    return page_of("page.html", contents=contents, images=images_of(contents))
-
-
 def page_of(template: str, **values: Any) -> str:
     """Return the page of a template, with its style and script."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -363,17 +346,9 @@ def page_of(template: str, **values: Any) -> str:
     return environment.get_template(template).render(css=css, script=script, **values)
 
 
-def images_of(contents: Contents) -> dict[str, str]:
-    """Return the pictures of a run by name, encoded for the page."""
-    return {picture.name: base64.b64encode(picture.path.read_bytes()).decode("ascii") for picture in contents.pictures}
-
-
 def write_report(folder: Path) -> Path:
-    """Write report.html into the folder of a finished run, completely or not at all, and return its path.
-
-    Raises InputError for other folders.
-    """
-    return write_page(render(read_contents(RunFolder(folder))), folder / REPORT)
+    """Write report.html into the folder of a finished run, and return its path; raises InputError for other folders."""
+    return write_page(page_of("page.html", contents=read_contents(RunFolder(folder))), folder / REPORT)
 
 
 def write_page(page: str, path: Path) -> Path:
@@ -392,11 +367,9 @@ MOST = len(COLOURS) - 1
 
 @dataclass(frozen=True)
 class Several:
-    """Some runs, and their common contents.
+    """Some runs, by the names of theirs or of their folders, and their common contents.
 
-    Names are those of the runs, or of their folders if two runs have one name. Differences are the fields of the
-    experiments that differ. Claims, the papers' statements with the verdicts on all, are None if no run has any. A
-    picture or table is None where a run lacks it.
+    Claims are None if no run has any, and a picture or table where a run lacks it.
     """
 
     contents: Sequence[Contents]
@@ -495,12 +468,10 @@ def _claims(found: Sequence[Table | None], names: Sequence[str]) -> Table | None
 
 
 def write_several(folders: Sequence[Path], output: Path, overwrite: bool = False) -> Path:
-    """Write the page of several runs, completely or not at all, and return its path.
+    """Write the page of several runs, and return its path.
 
     Raises InputError if a folder is not that of a finished run, or the file exists and `overwrite` is false.
     """
     if output.exists() and not overwrite:
         raise InputError(f"{output}: exists; choose another --output, or --overwrite it")
-    several = read_several(folders)
-    page = page_of("several.html", several=several, images=[images_of(found) for found in several.contents])
-    return write_page(page, output)
+    return write_page(page_of("several.html", several=read_several(folders)), output)

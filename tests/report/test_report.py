@@ -18,7 +18,8 @@ from calstudy.power.settings import PowerSettings
 from calstudy.power.tables import save_spectrum
 from calstudy.power.transfer import TransferFunction
 from calstudy.products.signal_loss import SweepSummary, Transfer
-from calstudy.report.page import read_contents, recorded_warnings, render, write_report
+from calstudy.report.page import page_of as rendered
+from calstudy.report.page import read_contents, recorded_warnings, write_report
 from calstudy.results.reader import RunFolder
 
 
@@ -77,7 +78,8 @@ def test_the_page_needs_nothing_but_itself(folder):
 
 def test_tables_of_one_subject_have_one_link_in_the_menu(folder):
     tables = [Table(("k",), [("1",)], title) for title in ("Scores: ideal", "Scores: no sky", "Stages")]
-    page = Page(render(dataclasses.replace(read_contents(RunFolder(folder)), tables=tables)))
+    contents = dataclasses.replace(read_contents(RunFolder(folder)), tables=tables)
+    page = Page(rendered("page.html", contents=contents))
     links = [value for _, name, value in page.attributes if name == "href" and value.startswith("#table")]
     assert links == ["#table-1", "#table-3"]
 
