@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
+from calstudy.calibrate.agreement import Statistic
 from calstudy.corrupt.effects.gains import ReflectionGains
+from calstudy.power.delay import horizon_delay
 from calstudy.power.spectra import SphericalSpectrum
+from calstudy.simulate.floor import MAIN_LOBES
 from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
@@ -41,12 +44,16 @@ def used_bins(*spectra: SphericalSpectrum, k_min: float = 0.0, k_max: float = np
     return used
 
 
-def reflection_bins(run: Tables, experiment: Experiment, spectrum: SphericalSpectrum) -> np.ndarray:
-    """Return the bins of k, (Nk,) bool, of the positive delays of the reflections of an experiment.
+def outside_wedge(
+    run: Tables, *variants: str, k_min: float = 0.0, k_max: float = np.inf
+) -> tuple[np.ndarray, list[SphericalSpectrum]]:
+    """Return the `used_bins` of the spectra of some variants outside the wedge, and the spectra."""
+    spectra = [run.spherical(variant, "outside-wedge") for variant in variants]
+    return used_bins(*spectra, k_min=k_min, k_max=k_max), spectra
 
-    They are within two standard deviations of the mean delay. Raises Unevaluated if the gains have no reflections, or
-    the delays are in no bin with modes.
-    """
+
+def reflection_bins(run: Tables, experiment: Experiment, spectrum: SphericalSpectrum) -> np.ndarray:
+    """Return the bins of k, (Nk,) bool, of the positive delays of reflections; raises Unevaluated if there are none."""
     gains = experiment.corruption.gains
     if not isinstance(gains, ReflectionGains):
         raise Unevaluated("the gains have no reflections")
@@ -58,6 +65,30 @@ def reflection_bins(run: Tables, experiment: Experiment, spectrum: SphericalSpec
     if not chosen.any():
         raise Unevaluated("no modes at the delays of the reflections")
     return chosen
+
+
+def at_reflections(run: Tables, experiment: Experiment, known: str) -> tuple[float, float, float]:
+    """Return P^V and P^R at the delays of the reflections, outside the wedge, and the standard deviation of the noise.
+
+    They are means weighted with the inverse noise variance of P^R over the bins in which the variant `known` has power.
+    """
+    spectra = {name: run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual")}
+    chosen = reflection_bins(run, experiment, spectra[known])
+    weights = spectra["residual"].noise_error[chosen] ** -2.0
+    before, after = (float(np.sum(weights * item.power.real[chosen]) / weights.sum()) for item in spectra.values())
+    return before, after, float(weights.sum() ** -0.5)
+
+
+def beyond_wedge(delay: np.ndarray, lengths: np.ndarray, buffer: float) -> np.ndarray:
+    """Return which delays, s, are beyond horizon and buffer, or the taper's main lobe if wider, (Nlengths, Ndelays)."""
+    lobe = MAIN_LOBES["blackman-harris"] * (delay[1] - delay[0])
+    return np.abs(delay) > horizon_delay(lengths)[:, None] + max(buffer, lobe)
+
+
+def median_and_scatter(values: np.ndarray) -> Finding:
+    """Return the median with the scatter of the values, half the width of their central 68 %."""
+    found = Statistic.of(values, "")
+    return Finding(found.value, found.scatter, "scatter")
 
 
 def recovered(residual: SphericalSpectrum, eor: SphericalSpectrum, k_min: float, k_max: float = np.inf) -> Finding:
@@ -75,8 +106,8 @@ def recovered_outside_wedge(run: Results, k_min: float, k_max: float = np.inf) -
     The flux scale s differs between draws of gains and noise by more than the noise of P^R. How far it is from 1 in
     this run is the one sample of that.
     """
-    residual, eor = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
-    found, used = recovered(residual, eor, k_min, k_max), used_bins(residual, eor, k_min=k_min, k_max=k_max)
+    used, (residual, eor) = outside_wedge(run, "residual", "eor", k_min=k_min, k_max=k_max)
+    found = recovered(residual, eor, k_min, k_max)
     signal, error = eor.power.real[used], residual.difference_error[used]
     weights = signal / error**2
     left = np.sum(weights * error_of_what_is_left(run)[used]) / np.sum(weights * signal)
@@ -103,10 +134,7 @@ def ratio(above: Finding, below: Finding) -> Finding:
 
 
 def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
-    """Return the mean of known values with inverse variances as weights; the errors are taken as common to all.
-
-    Bins of k share the gains, so that chance losses to the gains do not average down over bins.
-    """
+    """Return the mean, weighted with inverse variances, of values with a common error, such as that of shared gains."""
     known = np.isfinite(values) & np.isfinite(errors)
     if not known.any():
         raise Unevaluated("no bins with a transfer function")
@@ -115,10 +143,7 @@ def mean_of_common_errors(values: np.ndarray, errors: np.ndarray) -> Finding:
 
 
 def difference_of_losses(first: Results, second: Results, k_min: float, k_max: float = np.inf) -> Finding:
-    """Return T free of the flux scale of one run minus that of another, over bins from `k_min` to `k_max` in h/Mpc.
-
-    Raises Unevaluated if the bins of the runs differ, or none has a T.
-    """
+    """Return T free of the flux scale of one run minus that of another, over their common bins of k, h/Mpc."""
     one, other = (run.transfer("outside-wedge") for run in (first, second))
     if not np.array_equal(one.bin_edges, other.bin_edges):
         raise Unevaluated("the transfer functions have different bins of k")
@@ -196,11 +221,9 @@ def pull_without_eor(run: Results, used: np.ndarray) -> Finding:
 def bias(run: Results, k_min: float, k_max: float) -> Finding:
     """Return s^2 P^R0 / P^S outside the wedge: the residual without EoR over the EoR, free of the flux scale s.
 
-    Bins of k (h/Mpc) are weighted with their modes. For uncertainty and errors see `power_without_eor`; it also
-    raises Unevaluated if there are no modes in the range.
+    Bins of k (h/Mpc) are weighted with their modes; for uncertainty and errors see `power_without_eor`.
     """
-    eor, residual = (run.spherical(variant, "outside-wedge") for variant in ("eor", "residual_without_eor"))
-    used = used_bins(eor, residual, k_min=k_min, k_max=k_max)
+    used, (eor, _) = outside_wedge(run, "eor", "residual_without_eor", k_min=k_min, k_max=k_max)
     modes = eor.n_modes[used]
     left = power_without_eor(run, used, modes)
     unit = run.score.flux_scale**2 / float(np.sum(modes * eor.power.real[used]) / np.sum(modes))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ from calstudy.verdicts.tables import (
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Verdicts on the statements of papers, one for each statement.
+    """Verdicts on the statements of papers, one for each statement, and those `by_solver` (`evaluate_by_solver`).
 
     `without_role` has a sentence, with the reasons, for each paper in which a run plays no role, and which therefore
     has no verdicts, and for each member of a collection whose results do not suit its role.
@@ -44,6 +44,7 @@ class Evaluation:
 
     verdicts: list[Verdict]
     without_role: tuple[str, ...] = ()
+    by_solver: Mapping[str, list[Verdict]] = field(default_factory=dict)
 
     @property
     def is_empty(self) -> bool:
@@ -51,7 +52,7 @@ class Evaluation:
         return all(verdict.measured is None for verdict in self.verdicts)
 
 
-def evaluate_run(papers: Sequence[Paper], results: Results | PooledResults) -> Evaluation:
+def evaluate_run(papers: Sequence[Paper], results: Results | PooledResults | RunTimeTable) -> Evaluation:
     """Evaluate the statements of papers on the roles that one run plays."""
     verdicts: dict[str, list[Verdict]] = {}
     without_role = []
@@ -75,43 +76,33 @@ def _with_names_of_papers(verdicts: Mapping[str, list[Verdict]]) -> list[Verdict
     ]
 
 
-def refusals_of_run(paper: Paper, results: Results | PooledResults) -> dict[str, str | None]:
+def refusals_of_run(paper: Paper, results: Results | PooledResults | RunTimeTable) -> dict[str, str | None]:
     """Return the reason why a run cannot play each role of a paper, None for the roles that it plays."""
+    if isinstance(results, RunTimeTable):
+        return {RUN_TIME: None} if RUN_TIME in paper.roles else {}
+    return _refusals(paper, dict.fromkeys(paper.roles, results))
+
+
+def _refusals(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> dict[str, str | None]:
+    """Return the same for the roles of a paper, because another may have a role of the same name, that runs play."""
     with guarded(paper):
-        return {role: paper.refusal_of_run(role, results) for role in paper.roles}
+        return {role: paper.refusal_of_run(role, run) for role, run in runs.items() if role in paper.roles}
 
 
 def _told(paper: Paper, refusals: Mapping[str, str | None]) -> str:
-    """Explain in one sentence why a run plays no role, with every reason once."""
     roles: dict[str, list[str]] = {}
     for role, refusal in refusals.items():
         roles.setdefault(str(refusal), []).append(role)
     reasons = "; ".join(f"{refusal} ({', '.join(names)})" for refusal, names in roles.items())
-    return f"The run plays no role in {paper.label}: {reasons or 'the paper has none'}."
-
-
-def evaluate_run_times(papers: Sequence[Paper], run: RunTimeTable) -> Evaluation:
-    """Evaluate the statements of papers on run times."""
-    verdicts: list[Verdict] = []
-    without_role = []
-    for paper in papers:
-        if RUN_TIME in paper.roles:
-            verdicts += _evaluate(paper, {RUN_TIME: run}, only_played=True)
-        else:
-            without_role.append(f"The run plays no role in {paper.label}: the paper says nothing on run times.")
-    return Evaluation(verdicts, tuple(without_role))
+    return f"The run plays no role in {paper.label}: {reasons or 'the paper has none for it'}."
 
 
 def evaluate_members(papers: Sequence[Paper], runs: Mapping[str, Results | PooledResults]) -> Evaluation:
-    """Evaluate every statement of papers on the runs by role.
-
-    A statement whose roles no run plays is not evaluated, with the reason. If all runs pool realizations, statements
-    on single runs are left out.
-    """
+    """Evaluate every statement of papers on the runs by role; those on single runs not if all pool realizations."""
     pooled = bool(runs) and all(isinstance(run, PooledResults) for run in runs.values())
     verdicts = {paper.label: _evaluate(paper, _accepted(paper, runs), pooled) for paper in papers}
     refused = [reason for paper in papers for reason in _refused(paper, runs)]
-    return Evaluation(_with_names_of_papers(verdicts), tuple(refused))
+    return Evaluation(_with_names_of_papers(verdicts), tuple(refused), evaluate_by_solver(papers, runs))
 
 
 def evaluate_by_solver(
@@ -127,14 +118,13 @@ def evaluate_by_solver(
     names: dict[str, None] = {}
     for paper in papers:
         played = _accepted(paper, runs)
-        pairs = {role: role_of_own for role, role_of_own in paper.own_solver_roles.items() if role_of_own in played}
-        if not any(role in played for role in pairs):
-            continue
-        with_own = {name: played[pairs[role]] for role in pairs for name in (role, pairs[role])}
         with_other = {role: played[role] for role in paper.own_solver_roles if role in played}
-        own += _evaluate(paper, with_own)
-        other += _evaluate(paper, with_other)
-        names |= dict.fromkeys(_solver(run) for run in with_other.values())
+        both = {role: played[of_own] for role, of_own in paper.own_solver_roles.items() if of_own in played}
+        if with_other.keys() & both.keys():
+            with_own = both | {paper.own_solver_roles[role]: run for role, run in both.items()}
+            own += _evaluate(paper, with_own)
+            other += _evaluate(paper, with_other)
+            names |= dict.fromkeys(_solver(run) for run in with_other.values())
     return {"the paper's solver": own, ", ".join(names): other} if own else {}
 
 
@@ -144,23 +134,17 @@ def _solver(run: Results | PooledResults) -> str:
 
 
 def _accepted(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> dict[str, Results | PooledResults]:
-    """Return the runs whose roles a paper accepts, because another paper may have a role of the same name."""
-    with guarded(paper):
-        return {
-            role: run for role, run in runs.items() if role in paper.roles and paper.refusal_of_run(role, run) is None
-        }
+    return {role: runs[role] for role, refusal in _refusals(paper, runs).items() if refusal is None}
 
 
 def _refused(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> list[str]:
     """Explain why the results of runs do not suit their roles, where the settings do."""
-    found = []
     with guarded(paper):
-        for role, run in runs.items():
-            if role in paper.roles and paper.refusal(role, run.experiment) is None:
-                refusal = paper.refusal_of_run(role, run)
-                if refusal is not None:
-                    found.append(f"{run.name} does not play the role {role} of {paper.label}: {refusal}.")
-    return found
+        return [
+            f"{runs[role].name} does not play the role {role} of {paper.label}: {refusal}."
+            for role, refusal in _refusals(paper, runs).items()
+            if refusal is not None and paper.refusal(role, runs[role].experiment) is None
+        ]
 
 
 def _evaluate(
@@ -217,27 +201,23 @@ INSTEAD = "use --run-code if you trust who wrote the folder, or, if it is a pape
 def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> Evaluation:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
-    The folder is that of a run, or of a collection, whose members' folders are beside it. If members differ only in the
-    paper's own solver, claims-by-solver.json and .md are written too. If no statement is evaluated, nothing is written.
-    `papers` are names or files in place of those that the run names. Python files of these are always run, those of the
-    folder's experiments only with `run_code`.
-    Raises InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
+    If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too, and
+    nothing if no statement is evaluated. `papers` are names or files in place of those that the run names. Python files
+    of these are always run, those of the folder's experiments only with `run_code`. Raises
+    InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
     """
     run = RunFolder(folder)
     _require_evaluable(run)
     named = [_paper(name) for name in papers]
     with nullcontext() if run_code else without_code_of_files(INSTEAD):
-        found, by_solver = _evaluated(run, named)
+        found = _evaluated(run, named)
     if found.is_empty:
         return found
     with errors_of_files(f"{folder}: the claims cannot be written"):
-        write_claims(found.verdicts, folder, run.name, run.manifest["stand_ins"], found.without_role)
-        if by_solver:
-            write_claims_by_solver(by_solver, folder, run.name, run.manifest["stand_ins"])
-        else:
-            # Those of an earlier evaluation, of other members or papers.
-            for name in (BY_SOLVER_JSON, BY_SOLVER_MARKDOWN):
-                (folder / name).unlink(missing_ok=True)
+        # Those of an earlier evaluation, of other members or papers.
+        for name in (BY_SOLVER_JSON, BY_SOLVER_MARKDOWN):
+            (folder / name).unlink(missing_ok=True)
+        _write(folder, found, run.name, run.manifest["stand_ins"])
     return found
 
 
@@ -253,20 +233,16 @@ def _require_evaluable(run: RunFolder) -> None:
         )
 
 
-def _evaluated(run: RunFolder, named: Sequence[Paper]) -> tuple[Evaluation, Mapping[str, list[Verdict]]]:
-    """Return the verdicts of a folder, and those by solver of a collection."""
-    if run.manifest.get("kind") == "runtime":
-        times = _run_times(run.name, run.tables)
-        return evaluate_run_times(_named(named, run.content.get("papers", ()), run.path), times), {}
+def _evaluated(run: RunFolder, named: Sequence[Paper]) -> Evaluation:
     if "members" in run.manifest:
-        held_to, runs = _played(run, named)
-        return evaluate_members(held_to, runs), evaluate_by_solver(held_to, runs)
+        return evaluate_members(*_played(run, named))
+    if run.manifest.get("kind") == "runtime":
+        return evaluate_run(_named(named, run.content.get("papers", ()), run.path), _run_times(run.name, run.tables))
     results = _results(run, named)
-    return evaluate_run(_named(named, results.experiment.papers, run.path), results), {}
+    return evaluate_run(_named(named, results.experiment.papers, run.path), results)
 
 
 def _played(run: RunFolder, named: Sequence[Paper]) -> tuple[list[Paper], dict[str, Results | PooledResults]]:
-    """Return the papers of a collection, and its members by the role that they play."""
     members = {name: _results(member, named) for name, member in run.members.items()}
     own = {paper.reference: paper for member in members.values() for paper in member.experiment.papers}
     chosen = _named(named, list(own.values()), run.path)
@@ -322,10 +298,7 @@ def claims(
     notes: Sequence[str],
     roles: Mapping[str, str] | None = None,
 ) -> Task | None:
-    """Return the task that evaluates the statements of papers on a run, or on several by role; None without papers.
-
-    A single run has no name. The notes are the substitutions of all runs for the papers' ingredients.
-    """
+    """Return the task that evaluates papers on a run without a name, or on several by role; None without papers."""
     if not papers:
         return None
     playing = runs if roles is None else {name: runs[name] for name in roles.values()}
@@ -356,8 +329,6 @@ class Claims(Task, stage="claims", version=16, cost=Cost(1, disk=1e5)):
         if self.roles is None:
             return _write(output, evaluate_run(self.papers, results[""]), self.title, self.notes)
         runs = {role: results[name] for role, name in self.roles.items()}
-        if by_solver := evaluate_by_solver(self.papers, runs):
-            write_claims_by_solver(by_solver, output, self.title, self.notes)
         return _write(output, evaluate_members(self.papers, runs), self.title, self.notes)
 
     def _results(self, name: str, experiment: Experiment) -> Results | PooledResults:
@@ -381,10 +352,12 @@ class RunTimeClaims(Task, stage="runtime-claims", version=5, cost=Cost(1, disk=1
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write claims.json and claims.md."""
         times = _run_times(self.title, Tables((self.runtime,)))
-        return _write(output, evaluate_run_times(self.papers, times), self.title)
+        return _write(output, evaluate_run(self.papers, times), self.title)
 
 
 def _write(output: Path, found: Evaluation, title: str, notes: Sequence[str] = ()) -> dict[str, Any]:
     write_claims(found.verdicts, output, title, notes, found.without_role)
+    if found.by_solver:
+        write_claims_by_solver(found.by_solver, output, title, notes)
     contradicted = [claim.name for claim in found.verdicts if claim.verdict == "contradicted"]
     return {"verdicts": tally(found.verdicts), "contradicted": contradicted, "without_role": list(found.without_role)}

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.experiment.model import PAPERS, Experiment
+from calstudy.verdicts.statement import Statement
 
 if TYPE_CHECKING:
     from calstudy.claims.realizations import PooledResults
     from calstudy.results.reader import Results
-    from calstudy.verdicts.statement import Statement
 
 
 class Paper(Plugin):
     """Base class of papers.
 
-    Attributes
-    ----------
-    citation : authors, year, title, identifier
-    roles : roles of runs in the paper's statements, with a description of the run in words that follow "needs"
-    usual_members : name of the member of a collection that plays a role, unless its file names another
-    own_solver_roles
-        For a role, the role of the run that differs only in its solver, which is the paper's own. If both are
-        played, every statement is evaluated with either solver.
+    The `citation` has authors, year, title and identifier. `roles` are those of runs in the paper's statements, each
+    with a description of the run in words that follow "needs", and `usual_members` the names of the members of a
+    collection that play them, unless its file names others. `own_solver_roles` has for a role that of the run which
+    differs only in its solver, the paper's own: if both are played, every statement is evaluated with either solver.
     """
 
     registry: ClassVar = PAPERS
@@ -36,8 +33,8 @@ class Paper(Plugin):
     kind: str
 
     def statements(self) -> Sequence[Statement]:
-        """Return the statements, in the order of the paper."""
-        return ()
+        """Return the statements, in the order of the paper; by default those of the module that has the class."""
+        return [item for item in vars(sys.modules[type(self).__module__]).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return in words why the settings of an experiment do not allow it to play a role, or None.
@@ -45,7 +42,6 @@ class Paper(Plugin):
         Be strict: statements mislead if they are evaluated on a run of something else. Scale alone (fewer antennas,
         channels, integrations, sources) should not decide.
         """
-        del role, experiment
         return None
 
     def refusal_of_run(self, role: str, results: Results | PooledResults) -> str | None:
@@ -54,7 +50,6 @@ class Paper(Plugin):
 
     def substitutions(self, experiment: Experiment) -> tuple[str, ...]:
         """Return one short sentence for each ingredient that an experiment uses in place of the paper's own."""
-        del experiment
         return ()
 
 

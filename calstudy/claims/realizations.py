@@ -30,19 +30,10 @@ def bias_extent(ratio: np.ndarray, error: np.ndarray, edges: np.ndarray) -> floa
     used = np.flatnonzero(np.isfinite(ratio) & np.isfinite(error))
     if not used.size:
         raise Unevaluated("no bins have modes in all realizations")
-    last = _last_biased((1 - ratio[used]) / error[used] > SIGMAS_95)
-    return float(edges[used[0]] if last is None else edges[used[last] + 1])
-
-
-def _last_biased(biased: np.ndarray) -> int | None:
-    """Return the index of the last biased bin before two unbiased ones, or None if the first two are unbiased."""
-    last = None
-    for place, is_biased in enumerate(biased):
-        if is_biased:
-            last = place
-        elif place - (-1 if last is None else last) > 1:
-            break
-    return last
+    biased = (1 - ratio[used]) / error[used] > SIGMAS_95
+    without_two = np.flatnonzero(~(biased[:-1] | biased[1:]))
+    found = np.flatnonzero(biased[: without_two[0]] if without_two.size else biased)
+    return float(edges[used[found[-1]] + 1] if found.size else edges[used[0]])
 
 
 @dataclass(frozen=True)

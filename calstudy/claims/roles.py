@@ -12,6 +12,7 @@ from scipy.spatial.distance import pdist
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.paths import differences
 from calstudy.calibrate.settings import WeightedFit
+from calstudy.claims.bins import bias
 from calstudy.corrupt.drift import Correlated, Delays
 from calstudy.corrupt.effects.gains import Bandpass
 from calstudy.corrupt.interface import GainEffect
@@ -20,6 +21,7 @@ from calstudy.experiment.model import Experiment
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.layouts import make_array
 from calstudy.power.cosmology import k_parallel, make_cosmology
+from calstudy.verdicts.criterion import Finding
 from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
 INCOMPLETE = ("sky.foregrounds.flux_limit", "sky.foregrounds.count")
 """Fields of the assumed sky that leave sources out."""
 INVERSE_VARIANCES = ("gains", "autos")
-"""Kinds of weights that are inverse variances."""
 EXPECTED_AT, EXPECTED = 0.3, (2.0, 200.0)
 """Wavenumber, h/Mpc, and Delta^2 = k^3 P / (2 pi^2) there, mK^2, of an EoR as expected: about 20, to an order of
 magnitude."""
@@ -56,7 +57,6 @@ def unsuitable(
 
 
 def _other_calibrator(experiment: Experiment, allowed: Sequence[str]) -> str | None:
-    """Return a refusal of an experiment with none of the allowed calibrators, or None."""
     found = experiment.calibration.label
     return None if found in allowed else f"calibration.calibrator is {found!r}, not {' or '.join(map(repr, allowed))}"
 
@@ -92,11 +92,7 @@ def _other_weights(experiment: Experiment) -> str | None:
 
 
 def _other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
-    """Return a refusal of the sky model, or None.
-
-    With `incomplete`, sources have to be missing and no other assumption may be wrong; otherwise the sky model has
-    to be that of the nominal instrument and the true sky.
-    """
+    """Return a refusal of the sky model if another assumption than `incomplete` sources is wrong, or None."""
     changes = assumed_changes(experiment.calibration.assumed)
     others = [path for path in changes if path not in INCOMPLETE]
     if others:
@@ -107,10 +103,7 @@ def _other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
 
 
 def _other_faults(experiment: Experiment, allowed: str | None = None) -> str | None:
-    """Return in words a fault of the instrument as built or of the data, besides gains, or None.
-
-    A role may require a fault in the field `allowed` of `instrument.as_built`, such as "dipoles.dead_tiles".
-    """
+    """Return in words a fault of the instrument as built, but in the field `allowed`, or of the data, or None."""
     for path, _, value in differences(AsBuilt().model_dump(), experiment.instrument.as_built.model_dump()):
         if path != allowed and not path.endswith("seed"):
             return f"instrument.as_built.{path} is {value}"
@@ -166,3 +159,10 @@ def require_same_world(first: Results, second: Results) -> None:
             raise Unevaluated(f"the runs differ in {section}")
     if assumed_changes(one.calibration.assumed) != assumed_changes(other.calibration.assumed):
         raise Unevaluated("the runs differ in calibration.assumed")
+
+
+def bias_of_expected_signal(run: Results, k_min: float, k_max: float) -> Finding:
+    """Return the `bias` of a run whose baselines reach `k_max`, h/Mpc, and whose EoR is as strong as expected."""
+    require_long_baselines(run, k_max)
+    require_expected_signal(run)
+    return bias(run, k_min, k_max)

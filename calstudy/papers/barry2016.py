@@ -5,8 +5,8 @@ The statements are in our words, after the paper's abstract.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
 from calstudy.calibrate.interface import PolynomialSmoothing
 from calstudy.calibrate.settings import GainFit
@@ -14,12 +14,10 @@ from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
 from calstudy.claims.roles import k_of_delay, require_long_baselines, structured_gains, unsuitable
 from calstudy.corrupt.effects.gains import PerChannelGains, ReflectionGains
+from calstudy.experiment.model import Experiment
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
-from calstudy.verdicts.statement import Source, Statement, Unevaluated
-
-if TYPE_CHECKING:
-    from calstudy.experiment.model import Experiment
-    from calstudy.results.reader import Results
+from calstudy.verdicts.statement import Source, Unevaluated
 
 WINDOW = (0.2, 0.5)
 """Range of k beyond the wedge and its leakage by the taper, h/Mpc."""
@@ -110,17 +108,7 @@ class Barry2016(Paper):
         "structured_antennas": "long-smoothed-reflections",
     }
 
-    def statements(self) -> Sequence[Statement]:
-        """Return the statements."""
-        return [
-            incomplete_model_contaminates_window,
-            complete_model_leaves_window_clean,
-            smooth_antennas_leave_window_clean,
-            structured_antennas_contaminate_window,
-        ]
-
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return in words an unsuitable setting of an experiment for a role, or None."""
         return unsuitable(
             experiment,
             ("sky-based", "skycal"),

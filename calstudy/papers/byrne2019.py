@@ -5,21 +5,19 @@ The statements are in our words, after the paper's abstract.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
 from calstudy.claims.bins import bias
 from calstudy.claims.paper import Paper
 from calstudy.claims.roles import unsuitable
+from calstudy.experiment.model import Experiment
 from calstudy.instrument.layouts import make_array, redundant_groups
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding
-from calstudy.verdicts.statement import Source, Statement
-
-if TYPE_CHECKING:
-    from calstudy.experiment.model import Experiment
-    from calstudy.results.reader import Results
+from calstudy.verdicts.statement import Source
 
 CRUCIAL = (0.1, 0.2)
 """Range of k in which the noise allows a detection first, h/Mpc."""
@@ -67,12 +65,7 @@ class Byrne2019(Paper):
         "redundant_incomplete": "redcal-incomplete",
     }
 
-    def statements(self) -> Sequence[Statement]:
-        """Return the statements."""
-        return [absolute_calibration_overwhelms_eor, complete_model_leaves_crucial_modes]
-
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return in words an unsuitable setting of an experiment for a role, or None."""
         steps = getattr(experiment.calibration, "steps", ())
         partial = None if "omnical" in steps else "calibration.steps has no omnical"
         found = unsuitable(experiment, ("redcal",), partial, incomplete=role == "redundant_incomplete")

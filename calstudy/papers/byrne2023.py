@@ -5,21 +5,18 @@ The statements are in our words, after the paper's abstract.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
 from calstudy.claims.bins import bias, ratio
 from calstudy.claims.paper import Paper
 from calstudy.claims.roles import require_long_baselines, require_same_world, unsuitable
+from calstudy.experiment.model import Experiment
+from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, Finding, Within
-from calstudy.verdicts.statement import Source, Statement, Unevaluated
-
-if TYPE_CHECKING:
-    from calstudy.experiment.model import Experiment
-    from calstudy.results.reader import Results
+from calstudy.verdicts.statement import Source, Unevaluated
 
 WINDOW = (0.2, 0.5)
-"""Range of k, h/Mpc."""
 MEASURED = 5.0
 """Standard deviations of a bias from zero, below which a ratio to it is a lower limit."""
 HUNDRED = Within(10**1.5, 10**2.5)
@@ -78,11 +75,6 @@ class Byrne2023(Paper):
         "delay_weighted": "long-delay-weighted-incomplete",
     }
 
-    def statements(self) -> Sequence[Statement]:
-        """Return the statements."""
-        return [error_of_calibration_is_reduced, sensitivity_improves_hundredfold]
-
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return in words an unsuitable setting of an experiment for a role, or None."""
         allowed = ("delay-weighted",) if role == "delay_weighted" else ("sky-based", "skycal")
         return unsuitable(experiment, allowed, incomplete=True)

@@ -22,7 +22,7 @@ from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
 from calstudy.studies.folder import publish, write
 from calstudy.studies.study import RunProducts, Study, run_study
-from calstudy.validation.step import FINDINGS, MINREDUNDANT, STEPS, Case, Step, inputs_of, step_task
+from calstudy.validation.step import CHAIN, FINDINGS, MINREDUNDANT, STEPS, Case, Step, inputs_of, step_task
 from calstudy.verdicts.criterion import Verdict
 from calstudy.verdicts.tables import CLAIMS_JSON, CLAIMS_MARKDOWN, to_json, to_markdown
 
@@ -41,10 +41,7 @@ class LadderFile(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Ladder(Study):
-    """Steps of the validation ladder, each with its experiments by name.
-
-    `failures` are the steps that could not be measured, by number, with the reason.
-    """
+    """Steps of the ladder, each with its experiments by name, and why some could not be measured, by number."""
 
     file: LadderFile
     steps: Steps
@@ -126,7 +123,7 @@ class Ladder(Study):
 
     def _judged(self, step: Step, made: RunProducts) -> tuple[list[Verdict], list[str]]:
         if (reason := self.failures.get(step.number)) is not None:
-            return [statement.unevaluated(reason) for statement in step.statements()], []
+            return [criterion.unevaluated(reason) for criterion in step.criteria.values()], []
         measured = read_json(made.products[self.measurements[step.number].key].path / FINDINGS)
         return step.judge(measured["findings"]), measured["remarks"]
 
@@ -195,7 +192,7 @@ def _make(reference: str, scale: str) -> Step:
 
 def _experiment(scale: str, overrides: Sequence[str], name: str, case: Case) -> Experiment:
     """Validate an experiment of a step; relative paths start at the folder of the published experiments."""
-    path, changes = (case.file, case.overrides) if scale == "full" else (case.small_file, case.small)
+    path, changes = (case.file, case.overrides) if scale == "full" else (CHAIN, case.small)
     file = StudyFile.open(published("experiments") / path, None, overrides)
     try:
         return validate(replace(file, content=overridden(file.content, changes)).changed(), file.folder)

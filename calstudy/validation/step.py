@@ -1,4 +1,4 @@
-"""Steps of the validation ladder: papers of our own, whose statements are limits of numbers that a step measures.
+"""Steps of the validation ladder: what each proves, its experiments, and the limits of the numbers that it measures.
 
 The built-in ones are the modules of `calstudy.validation.steps`; a user's own is the path of a Python file.
 """
@@ -9,7 +9,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, NamedTuple, cast
@@ -19,11 +18,10 @@ from pydantic import Field
 
 from calstudy.base.errors import InputError
 from calstudy.base.files import json_number
-from calstudy.base.plugins import Registry, guarded
+from calstudy.base.plugins import Plugin, Registry, guarded
 from calstudy.base.resources import Cost
 from calstudy.base.schema import UNKEYED
 from calstudy.claims.bins import clustered_mean
-from calstudy.claims.paper import Paper
 from calstudy.corrupt.levels import Levels
 from calstudy.experiment.model import Experiment
 from calstudy.power.cosmology import input_power
@@ -34,24 +32,21 @@ from calstudy.products.graph import Graph
 from calstudy.products.spectra import read_delay_spectra
 from calstudy.results.reader import Tables
 from calstudy.run.task import Inputs, Task
-from calstudy.verdicts.criterion import Criterion, Finding, Outcome, Threshold, Verdict
-from calstudy.verdicts.statement import Statement, Unevaluated
+from calstudy.verdicts.criterion import Criterion, Finding, Threshold, Verdict
+from calstudy.verdicts.statement import Unevaluated
 
 STEPS: Registry[Step] = Registry("step", "calstudy.validation.steps", "calstudy.validation.step:Step", families=True)
 FINDINGS = "measurement.json"
 CHAIN = "validation/small/chain.yaml"
 """The experiment of all steps at small scale."""
-ROLE = "measurement"
-"""The role that the numbers of a step play in its statements."""
 
 
 class Case(NamedTuple):
-    """An experiment of a step: the published file, or any other; at small scale `small_file` with other overrides."""
+    """An experiment of a step: the published file, or any other; at small scale `CHAIN` with other overrides."""
 
     file: str
     overrides: Mapping[str, Any] = {}
     small: Mapping[str, Any] = {}
-    small_file: str = CHAIN
 
 
 MINREDUNDANT = Case("minredundant.yaml")
@@ -69,14 +64,6 @@ class Limit(NamedTuple):
     threshold: Threshold
     why: str
     small: Threshold | Literal["the same", "full scale only"] = "the same"
-
-
-class LimitStatement(Statement):
-    """A limit of our own: it holds or not."""
-
-    def outcome(self, finding: Finding) -> Outcome:
-        """Return PASS or FAIL for a finite number."""
-        return Criterion.outcome(self, finding)
 
 
 @dataclass(frozen=True)
@@ -118,34 +105,16 @@ class StepInput(Tables):
         return read_delay_spectra(self.products[product])
 
 
-class Measured(NamedTuple):
-    """The numbers of a step, as its product has them: value and uncertainty, null if not finite, by name."""
-
-    name: str
-    findings: Mapping[str, Mapping[str, float | None]]
-
-    def finding(self, name: str) -> Finding:
-        """Return one of the numbers; raises Unevaluated if there is none."""
-        if name not in self.findings:
-            raise Unevaluated("not measured")
-        value, uncertainty = (math.nan if item is None else item for item in self.findings[name].values())
-        return Finding(value, uncertainty)
-
-
-class Step(Paper):
+class Step(Plugin):
     """Base class of the steps; fields of subclasses are parameters of their measurements.
 
-    Attributes
-    ----------
-    number, proves : its place in the ladder, such as "2.1", and what it proves, in words
-    experiments : the experiments on whose products it measures, by name
-    sections : those of the experiments that the measurement itself reads, not those that only affect products
-    parameters, small_parameters : values of the fields, and others of these at small scale
-    limits : the conditions on its numbers, by name
+    `proves` says what in words; `number` is its place in the ladder, such as "2.1". `experiments` are those on whose
+    products it measures, by name, and `sections` those of them that the measurement itself reads, not those that only
+    affect products. `parameters` are the values of the fields, and `small_parameters` others at small scale. `limits`
+    are the conditions on its numbers, by name.
     """
 
     registry: ClassVar = STEPS
-    roles: ClassVar[Mapping[str, str]] = {ROLE: "a measurement"}
     number: ClassVar[str] = ""
     proves: ClassVar[str] = ""
     experiments: ClassVar[Mapping[str, Case]] = {}
@@ -154,31 +123,38 @@ class Step(Paper):
     small_parameters: ClassVar[Mapping[str, Any]] = {}
     limits: ClassVar[Mapping[str, Limit]] = {}
 
+    kind: str
     scale: Literal["full", "small"] = Field("full", json_schema_extra=UNKEYED)
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return the products of one experiment that the measurement reads, by names of its own."""
-        del graph
         return {}
 
     @abstractmethod
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
         """Measure on the experiments, and write figures and tables, if any, to the folder `output`."""
 
-    def statements(self) -> list[Statement]:
-        """Return the limits that apply at the scale of the step."""
-        found: list[Statement] = []
+    @property
+    def criteria(self) -> dict[str, Criterion]:
+        """The limits that apply at the scale of the step."""
+        found = {}
         for name, limit in self.limits.items():
             threshold = limit.threshold if self.scale == "full" or limit.small == "the same" else limit.small
             if not isinstance(threshold, str):
-                texts = (f"{self.number} {name}", "", self.proves, limit.quantity, threshold, limit.why)
-                found.append(LimitStatement(*texts, (ROLE,), partial(Measured.finding, name=name), ""))
+                texts = (f"{self.number} {name}", "", self.proves, limit.quantity)
+                found[name] = Criterion(*texts, threshold, limit.why)
         return found
 
-    def judge(self, findings: Mapping[str, Any]) -> list[Verdict]:
-        """Return the verdicts on measured numbers, as `measure` of this module writes them."""
-        measured = Measured(", ".join(self.experiments) or self.label, findings)
-        return [statement.evaluate({ROLE: measured}, self.roles) for statement in self.statements()]
+    def judge(self, findings: Mapping[str, Mapping[str, float | None]]) -> list[Verdict]:
+        """Return the verdicts on measured numbers, as `Validate` writes them: null if not finite."""
+        runs, verdicts = (", ".join(self.experiments) or self.label,), []
+        for name, criterion in self.criteria.items():
+            if name in findings:
+                value, uncertainty = (math.nan if item is None else item for item in findings[name].values())
+                verdicts.append(criterion.judge(Finding(value, uncertainty), runs))
+            else:
+                verdicts.append(criterion.unevaluated("not measured", runs))
+        return verdicts
 
 
 def only(runs: Mapping[str, StepInput]) -> StepInput:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
 
 Outcome = Literal["PASS", "FAIL", "supported", "contradicted", "undecided", "not evaluated"]
 """PASS and FAIL are for limits of our own; the next three are for statements of others."""
@@ -24,102 +24,78 @@ class Finding(NamedTuple):
     kind: Kind = "error"
 
 
+class Threshold:
+    """A condition on a measured number: from `low` to `high`, and `str` gives its words.
+
+    By `sigmas` uncertainties a number must be within it or, for a single value, may deviate.
+    """
+
+    low: float
+    high: float
+    sigmas: float
+
+    def holds(self, finding: Finding) -> bool:
+        """Return true if a finite value is in the interval, by that much."""
+        margin = self.sigmas * finding.uncertainty if self.sigmas else 0.0
+        return self.low <= finding.value - margin and finding.value + margin <= self.high
+
+    def __str__(self) -> str:
+        by = f" by {self.sigmas:g} sigma" if self.sigmas else ""
+        if math.isinf(self.high):
+            return f">= {self.low:.3g}{by}"
+        return f"<= {self.high:.3g}{by}" if math.isinf(self.low) else f"from {self.low:.3g} to {self.high:.3g}"
+
+
 @dataclass(frozen=True)
-class Within:
+class Within(Threshold):
     """From `low` to `high`."""
 
     low: float
     high: float
-    sigmas: ClassVar[float] = 0.0
-
-    def holds(self, finding: Finding) -> bool:
-        """Return true if the value is in the interval."""
-        return self.low <= finding.value <= self.high
-
-    def __str__(self) -> str:
-        return f"from {self.low:.3g} to {self.high:.3g}"
+    sigmas: float = field(default=0.0, init=False)
 
 
 @dataclass(frozen=True)
-class AtLeast:
+class AtLeast(Threshold):
     """At least `low`, by `sigmas` times the uncertainty."""
 
     low: float
     sigmas: float = 0.0
-    high: ClassVar[float] = math.inf
-
-    def holds(self, finding: Finding) -> bool:
-        """Return true if the value is that far above the bound."""
-        return finding.value - self.sigmas * finding.uncertainty >= self.low
-
-    def __str__(self) -> str:
-        return f">= {self.low:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
+    high: float = field(default=math.inf, init=False)
 
 
 @dataclass(frozen=True)
-class AtMost:
+class AtMost(Threshold):
     """At most `high`, by `sigmas` times the uncertainty."""
 
     high: float
     sigmas: float = 0.0
-    low: ClassVar[float] = -math.inf
-
-    def holds(self, finding: Finding) -> bool:
-        """Return true if the value is that far below the bound."""
-        return finding.value + self.sigmas * finding.uncertainty <= self.high
-
-    def __str__(self) -> str:
-        return f"<= {self.high:.3g}" + (f" by {self.sigmas:g} sigma" if self.sigmas else "")
+    low: float = field(default=-math.inf, init=False)
 
 
-@dataclass(frozen=True)
-class Equal:
+class Equal(Threshold):
     """Equal to `target` within `sigmas` times the uncertainty."""
 
-    target: float
-    sigmas: float = 2.0
-
-    @property
-    def low(self) -> float:
-        """The target."""
-        return self.target
-
-    @property
-    def high(self) -> float:
-        """The target."""
-        return self.target
+    def __init__(self, target: float, sigmas: float = 2.0) -> None:
+        self.low = self.high = target
+        self.sigmas = sigmas
 
     def holds(self, finding: Finding) -> bool:
         """Return true if the value is that close to the target."""
-        return abs(finding.value - self.target) <= self.sigmas * finding.uncertainty
+        return abs(finding.value - self.low) <= self.sigmas * finding.uncertainty
 
     def __str__(self) -> str:
-        return f"{self.target:.3g} within {self.sigmas:g} sigma"
-
-
-Threshold = Within | AtLeast | AtMost | Equal
-"""A condition on a measured number: it `holds` from `low` to `high`, and `str` gives its words.
-
-By `sigmas` uncertainties a number must be within it or, for a single value, may deviate."""
+        return f"{self.low:.3g} within {self.sigmas:g} sigma"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A criterion, evaluated.
+    """A criterion, evaluated: its texts, the number with its uncertainty, of the kind of `Finding`, and the outcome.
 
-    Attributes
-    ----------
-    name : short and unique
-    section, sentence : the tested sentence, and its section
-    quantity : the measured quantity, in words
-    measured, uncertainty : the number and its uncertainty; None if there is none
-    threshold, why : the condition for the number, and the reason for it
-    runs : names of the runs that it was measured on
-    reason : why there is no number, or empty
-    kind : meaning of number and uncertainty, as in `Finding`
-    smallest_effect : of an undecided statement: the smallest distance of the number from it that the data could show
-    sentence_id : id of the paper's sentence, which may have several statements; empty for criteria of our own
-    tests_simulation : true if the number does not depend on a calibration, so that it tests the simulated data alone
+    `runs` are the names of the runs that it was measured on, and `reason` says why there is no number, or is empty. Of
+    an undecided statement, `smallest_effect` is the smallest distance of the number from it that the data could show.
+    `sentence_id` is the id of the paper's sentence, which may have several statements, and empty for criteria of our
+    own. `tests_simulation` is true if no calibration enters the number, so that it tests the simulated data alone.
     """
 
     name: str
@@ -154,28 +130,15 @@ class Criterion:
         """Return the verdict on a measured number, which is "not evaluated" if the number is not finite."""
         if not (math.isfinite(finding.value) and math.isfinite(finding.uncertainty)):
             return self.unevaluated("the measured number is not finite", runs)
-        return self._verdict(finding, self.outcome(finding), runs, "")
+        value, uncertainty = map(float, finding[:2])
+        found = replace(self.unevaluated("", runs), measured=value, uncertainty=uncertainty, kind=finding.kind)
+        return replace(found, **self._outcome(finding))
 
-    def outcome(self, finding: Finding) -> Outcome:
-        """Return PASS or FAIL for a finite number."""
-        return "PASS" if self.threshold.holds(finding) else "FAIL"
+    def _outcome(self, finding: Finding) -> dict[str, Any]:
+        """Return PASS or FAIL for a finite number, as a field of its verdict."""
+        return {"verdict": "PASS" if self.threshold.holds(finding) else "FAIL"}
 
     def unevaluated(self, reason: str, runs: Sequence[str] = ()) -> Verdict:
         """Return the verdict "not evaluated", with the reason."""
-        return self._verdict(None, "not evaluated", runs, reason)
-
-    def _verdict(self, finding: Finding | None, outcome: Outcome, runs: Sequence[str], reason: str) -> Verdict:
-        return Verdict(
-            name=self.name,
-            section=self.section,
-            sentence=self.sentence,
-            quantity=self.quantity,
-            measured=None if finding is None else float(finding.value),
-            uncertainty=None if finding is None else float(finding.uncertainty),
-            threshold=str(self.threshold),
-            why=self.why,
-            verdict=outcome,
-            runs=tuple(runs),
-            reason=reason,
-            kind="error" if finding is None else finding.kind,
-        )
+        texts = (self.name, self.section, self.sentence, self.quantity)
+        return Verdict(*texts, None, None, str(self.threshold), self.why, "not evaluated", tuple(runs), reason)

@@ -24,6 +24,7 @@ linear response where that is lower by more than the error of T.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,18 +39,21 @@ LARGEST_ERROR = 0.3
 """Standard deviation above which T is not measured."""
 
 
-def is_measured(transfer: float | None, error: float | None) -> bool:
-    """Return whether T is measured; a T or an error that is None is not known."""
-    return why_not_measured(transfer, error) == ""
-
-
 def why_not_measured(transfer: float | None, error: float | None) -> str:
-    """Explain in a few words why T is not measured; return an empty text where it is."""
+    """Explain in a few words why T is not measured; return an empty text where it is.
+
+    A T or an error that is None is not known.
+    """
     if error is not None and error > LARGEST_ERROR:
         return f"error {error:.2g}"
     if transfer is None or math.isnan(transfer):
         return "no modes"
     return "" if LOWEST <= transfer <= HIGHEST else f"T {transfer:.2g}"
+
+
+def is_measured(transfer: float | None, error: float | None) -> bool:
+    """Return whether T is measured."""
+    return not why_not_measured(transfer, error)
 
 
 def marked(text: str, transfer: float | None, error: float | None) -> str:
@@ -88,7 +92,10 @@ def upper_limit(bias: float, error: float) -> float:
 
 @dataclass(frozen=True)
 class InWorld:
-    """A calibrator in a band of k and a world: T and bias are NaN where they are not known, or it cannot work."""
+    """A calibrator in a band of k and a world, with its numbers of solves by status.
+
+    T and bias are NaN where they are not known, or it cannot work.
+    """
 
     world: str
     transfer: float = math.nan
@@ -98,7 +105,6 @@ class InWorld:
     linear_transfer: float = math.nan
     refused: bool = False
     solves: Mapping[str, int] = field(default_factory=dict)
-    """Number of solves by status."""
 
     def standing(self, limit: float) -> Standing:
         """Return whether the bias is below the limit."""
@@ -176,11 +182,8 @@ class InBand:
     def kept(self) -> str:
         """The smallest T, and in how many worlds T is measured if that is not in all."""
         known, n_worlds = len(self._measured), len(self.worlds)
-        if not known:
-            return "T not measured"
-        return f"T ≥ {self.transfer:.2f}" + (
-            f" where measured, {known} of {n_worlds} worlds" if known < n_worlds else ""
-        )
+        where = f" where measured, {known} of {n_worlds} worlds" if known < n_worlds else ""
+        return f"T ≥ {self.transfer:.2f}{where}" if known else "T not measured"
 
     @property
     def decisive(self) -> list[InWorld]:
@@ -196,17 +199,12 @@ class InBand:
 
     @property
     def numbers(self) -> str:
-        """The upper limit of the bias in all worlds, and the smallest T."""
+        """The upper limit of the bias in all worlds, the smallest T, and how many solves did not converge."""
         limit = self.upper_limit
         bias = "bias or its error not known" if math.isnan(limit) else f"bias < {two_digits(limit)}"
-        return f"{bias}, {self.kept}{self._not_converged}"
-
-    @property
-    def _not_converged(self) -> str:
-        """How many solves of all worlds did not converge; nothing if all did."""
         count = sum(sum(world.solves.values()) for world in self.worlds)
         rest = count - sum(settled(world.solves) for world in self.worlds)
-        return f", {rest} of {count} solves not converged" if rest else ""
+        return f"{bias}, {self.kept}" + (f", {rest} of {count} solves not converged" if rest else "")
 
     def __str__(self) -> str:
         decisive = self.decisive
@@ -236,27 +234,22 @@ def standings(
     Scores are by world and calibrator, as in comparison.json; refusals are world, calibrator and reason of those that
     cannot work. The limit is the largest tolerated bias, over the EoR.
     """
-    found = []
     refused = dict.fromkeys((world, calibrator) for world, calibrator, _ in refusals if world in scores)
     scored = [name for cases in scores.values() for name in cases]
     calibrators = dict.fromkeys([*scored, *(calibrator for _, calibrator in refused)])
-    bands = dict.fromkeys(
-        tuple(band["k"]) for cases in scores.values() for summary in cases.values() for band in summary["bands"]
-    )
-    for low, high in bands:
-        for name in calibrators:
-            rows: list[InWorld] = []
-            for world, cases in scores.items():
-                if name in cases:
-                    bands_there = cases[name]["bands"]
-                    solves = cases[name].get("by_status", {})
-                    rows += [
-                        _in_world(world, entry, solves) for entry in bands_there if tuple(entry["k"]) == (low, high)
-                    ]
-                elif (world, name) in refused:
-                    rows.append(InWorld(world, refused=True))
-            if rows:
-                found.append(InBand(name, (low, high), rows, limit))
+    summaries = [summary for cases in scores.values() for summary in cases.values()]
+    bands = dict.fromkeys(tuple(band["k"]) for summary in summaries for band in summary["bands"])
+    found = []
+    for band, name in itertools.product(bands, calibrators):
+        rows: list[InWorld] = []
+        for world, cases in scores.items():
+            if name in cases:
+                solves, entries = cases[name].get("by_status", {}), cases[name]["bands"]
+                rows += [_in_world(world, entry, solves) for entry in entries if tuple(entry["k"]) == band]
+            elif (world, name) in refused:
+                rows.append(InWorld(world, refused=True))
+        if rows:
+            found.append(InBand(name, band, rows, limit))
     return found
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from calstudy.base.errors import InputError
-from calstudy.verdicts.criterion import Criterion, Equal, Finding, Outcome, Threshold, Verdict
+from calstudy.verdicts.criterion import Criterion, Equal, Finding, Threshold, Verdict
 
 SIGMAS = 2.0
 """Half the width of a 95 % interval, in standard deviations."""
@@ -47,43 +47,34 @@ class Statement(Criterion):
     tests_simulation: bool = False
     pooled: Callable[..., Finding] | None = None
 
-    def outcome(self, finding: Finding) -> Outcome:
-        """Return "supported", "contradicted" or "undecided" for a finite number."""
-        low, high = (finding.value + sign * self._margin(finding) for sign in (-1, 1))
-        if finding.kind == "at least":
-            high = math.inf
-        elif finding.kind == "at most":
-            low = -math.inf
-        # An interval that ends at a limit does not depend on rounding.
-        least, most, digit = self.threshold.low, self.threshold.high, LAST_DIGIT * self._margin(finding)
-        if least <= low + digit and high - digit <= most:
-            return "supported"
-        return "contradicted" if high < least - digit or low > most + digit else "undecided"
-
-    def _margin(self, finding: Finding) -> float:
-        """Return the half width of the interval around the number."""
+    def _outcome(self, finding: Finding) -> dict[str, Any]:
+        """Return "supported", "contradicted" or "undecided" for a finite number, and the smallest effect."""
         sigmas = self.threshold.sigmas
-        return finding.uncertainty * (sigmas if finding.kind == "scatter" else max(sigmas, SIGMAS))
+        margin = float(finding.uncertainty * (sigmas if finding.kind == "scatter" else max(sigmas, SIGMAS)))
+        low = -math.inf if finding.kind == "at most" else finding.value - margin
+        high = math.inf if finding.kind == "at least" else finding.value + margin
+        # An interval that ends at a limit does not depend on rounding.
+        least, most, digit = self.threshold.low, self.threshold.high, LAST_DIGIT * margin
+        if least <= low + digit and high - digit <= most:
+            return {"verdict": "supported"}
+        if high < least - digit or low > most + digit:
+            return {"verdict": "contradicted"}
+        return {"verdict": "undecided", "smallest_effect": margin if math.isfinite(high - low) else None}
 
-    def _verdict(self, finding: Finding | None, outcome: Outcome, runs: Sequence[str], reason: str) -> Verdict:
-        verdict = super()._verdict(finding, outcome, runs, reason)
-        if isinstance(self.threshold, Equal):
-            # No interval lies within a single number.
-            exact = f"exactly {self.threshold.target:.3g}, which errors can only contradict"
-            verdict = replace(verdict, threshold=exact)
-        undecided = finding is not None and outcome == "undecided" and finding.kind in ("error", "scatter")
+    def unevaluated(self, reason: str, runs: Sequence[str] = ()) -> Verdict:
+        """Return the verdict "not evaluated", with the reason."""
+        verdict = super().unevaluated(reason, runs)
+        # No interval lies within a single number.
+        exact = f"exactly {self.threshold.low:.3g}, which errors can only contradict"
         return replace(
             verdict,
-            smallest_effect=float(self._margin(finding)) if finding is not None and undecided else None,
+            threshold=exact if isinstance(self.threshold, Equal) else verdict.threshold,
             sentence_id=self.sentence_id,
             tests_simulation=self.tests_simulation,
         )
 
     def evaluate(self, runs: Mapping[str, Any], roles: Mapping[str, str]) -> Verdict:
-        """Return the verdict on runs, which have a `name`, by the roles that they play.
-
-        It is "not evaluated" if a role is not played; the reason contains the description of the role in `roles`.
-        """
+        """Return the verdict on runs, which have a `name`, by role; the reason names a role of `roles` not played."""
         missing = [roles[role] for role in self.roles if role not in runs]
         if missing:
             return self.unevaluated(f"needs {' and '.join(missing)}")
@@ -96,10 +87,7 @@ class Statement(Criterion):
 
 @dataclass(frozen=True)
 class Source:
-    """The section of a paper with some statements, and the roles of their runs.
-
-    `tests_simulation` is as in `Verdict`.
-    """
+    """The section of a paper with some statements, and the roles of their runs; `tests_simulation` as in `Verdict`."""
 
     section: str
     roles: tuple[str, ...]

@@ -88,12 +88,7 @@ def measured(verdict: Verdict) -> str:
         return f"{verdict.kind} {text}"
     if verdict.kind == "scatter":
         text = text.replace(" ± ", ", scatter ")
-    return text if verdict.smallest_effect is None else f"{text}; {visible(verdict.smallest_effect)}"
-
-
-def visible(smallest_effect: float) -> str:
-    """Write the smallest effect that the data could have shown."""
-    return f"smallest effect seen {smallest_effect:.2g}"
+    return text if verdict.smallest_effect is None else f"{text}; smallest effect seen {verdict.smallest_effect:.2g}"
 
 
 def count(words: Sequence[str], kinds: Iterable[str]) -> str:
@@ -108,18 +103,19 @@ def tally(verdicts: Sequence[Verdict]) -> str:
     return count([verdict.verdict for verdict in verdicts], LIMIT_OUTCOMES)
 
 
-def as_json(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """Return verdicts as JSON-able objects, without the fields that have their default."""
-    defaults = {field.name: field.default for field in fields(Verdict) if field.default is not MISSING}
-    return [
-        {name: value for name, value in asdict(verdict).items() if name not in defaults or value != defaults[name]}
-        for verdict in verdicts
-    ]
-
-
 def to_json(verdicts: Sequence[Verdict]) -> str:
-    """Return verdicts as a JSON list."""
-    return json.dumps(as_json(verdicts), indent=1, ensure_ascii=False, allow_nan=False)
+    """Return verdicts as a JSON list, without the fields that have their default."""
+    defaults = {field.name: field.default for field in fields(Verdict) if field.default is not MISSING}
+    return _dumped(
+        [
+            {name: value for name, value in asdict(verdict).items() if name not in defaults or value != defaults[name]}
+            for verdict in verdicts
+        ]
+    )
+
+
+def _dumped(found: list[dict[str, Any]]) -> str:
+    return json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
 
 
 def from_json(text: str) -> list[Verdict]:
@@ -139,14 +135,20 @@ def to_markdown(
 ) -> str:
     """Return verdicts as a Markdown document, one table per section.
 
-    Verdicts of one section must be consecutive. The headings are those of names and sentences, the summary (by
-    default the tally) is the line below the title, and the notes are substitutions for the paper's own ingredients.
+    The headings are those of names and sentences, and the notes are substitutions for the paper's own ingredients.
     """
-    lines = [f"# {title}", "", summary or tally(verdicts), ""]
-    lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
-    for section in dict.fromkeys(verdict.section for verdict in verdicts):
-        rows = [_cells(verdict) for verdict in verdicts if verdict.section == section]
-        table = Table((*headings, "measured", "must be", "why", ""), rows)
+    rows = [(verdict.section, _cells(verdict)) for verdict in verdicts]
+    summary = summary or tally(verdicts)
+    return _document(f"# {title}\n\n{summary}\n", notes, (*headings, "measured", "must be", "why", ""), rows)
+
+
+def _document(
+    head: str, notes: Sequence[str], headings: Sequence[str], rows: Sequence[tuple[str, tuple[str, ...]]]
+) -> str:
+    """Return a Markdown document with a table of each section; rows are preceded by theirs."""
+    lines = [head, *(f"Stand-in: {note}." for note in notes), *([""] if notes else [])]
+    for section in dict.fromkeys(section for section, _ in rows):
+        table = Table(headings, [cells for place, cells in rows if place == section])
         lines += ([f"## {section}", ""] if section else []) + [table.markdown(numbers=False)]
     return "\n".join(lines)
 
@@ -185,10 +187,7 @@ def show_verdicts(
     heading: str = "claim",
     summary: str | None = None,
 ) -> None:
-    """Print verdicts as a table, and then those that were not evaluated, by their missing inputs.
-
-    The heading is that of the first column; the summary is as for `to_markdown`.
-    """
+    """Print verdicts as a table, with the `heading` of the first column, and then those without a number by reason."""
     heading_line = escape(f"{title}: {summary or tally(verdicts)}")
     table = TerminalTable(title=heading_line, title_justify="left", show_lines=True, expand=True)
     for text, ratio in ((heading, 5), ("measured", 4), ("must be", 2)):
@@ -214,11 +213,7 @@ def write_claims(
     notes: Sequence[str] = (),
     without_role: Sequence[str] = (),
 ) -> None:
-    """Write the verdicts on a paper's statements to claims.json and claims.md in an existing folder.
-
-    The notes are substitutions for the paper's own ingredients; the sentences of `without_role`, reasons why papers
-    have no verdicts, are written below the table.
-    """
+    """Write verdicts to claims.json and claims.md in a folder, with reasons why papers have none, `without_role`."""
     (folder / CLAIMS_JSON).write_text(to_json(verdicts) + "\n", encoding="utf-8")
     summary = None if verdicts else "No claims."
     text = to_markdown(verdicts, f"Claims of the paper: {title}", ("claim", "the paper"), summary, notes)
@@ -232,28 +227,23 @@ RESULT = ("measured", "uncertainty", "kind", "smallest_effect", "verdict", "runs
 def write_claims_by_solver(
     columns: Mapping[str, Sequence[Verdict]], folder: Path, title: str, notes: Sequence[str] = ()
 ) -> None:
-    """Write the verdicts on the same statements with several solvers to claims-by-solver.json and claims-by-solver.md.
+    """Write verdicts on the same statements in the same order, by solver, to claims-by-solver.json and .md.
 
-    The verdicts of each solver are on the same statements in the same order. A statement that could not be evaluated
-    with any solver is left out.
+    A statement that could not be evaluated with any solver is left out.
     """
     rows = [row for row in zip(*columns.values(), strict=True) if any(item.measured is not None for item in row)]
     found = []
     for row in rows:
         statement = {name: getattr(row[0], name) for name in STATEMENT}
-        results = (({name: getattr(item, name) for name in RESULT}) for item in row)
+        results = ({name: getattr(item, name) for name in RESULT} for item in row)
         found.append({**statement, "solvers": dict(zip(columns, results, strict=True))})
-    text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
-    (folder / BY_SOLVER_JSON).write_text(text + "\n", encoding="utf-8")
-    lines = [f"# Claims of the paper, by solver: {title}", ""]
-    lines += [f"- {name}: {tally([row[place] for row in rows])}" for place, name in enumerate(columns)]
-    lines += ["", f"The verdict differs: {', '.join(_differing(rows)) or 'nowhere'}.", ""]
-    lines += [f"Stand-in: {note}." for note in notes] + ([""] if notes else [])
+    (folder / BY_SOLVER_JSON).write_text(_dumped(found) + "\n", encoding="utf-8")
+    tallies = "\n".join(f"- {name}: {tally([row[place] for row in rows])}" for place, name in enumerate(columns))
+    differing = f"The verdict differs: {', '.join(_differing(rows)) or 'nowhere'}."
+    head = f"# Claims of the paper, by solver: {title}\n\n{tallies}\n\n{differing}\n"
     headings = ("claim", "the paper", "measured is", "must be", *(cell for name in columns for cell in (name, "")))
-    for section in dict.fromkeys(row[0].section for row in rows):
-        cells = [_cells_by_solver(row) for row in rows if row[0].section == section]
-        lines += ([f"## {section}", ""] if section else []) + [Table(headings, cells).markdown(numbers=False)]
-    (folder / BY_SOLVER_MARKDOWN).write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    text = _document(head, notes, headings, [(row[0].section, _cells_by_solver(row)) for row in rows])
+    (folder / BY_SOLVER_MARKDOWN).write_text(text.rstrip() + "\n", encoding="utf-8")
 
 
 def _differing(rows: Iterable[Sequence[Verdict]]) -> list[str]:

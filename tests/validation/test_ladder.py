@@ -108,7 +108,7 @@ def test_the_table_of_results_has_the_limits_of_today():
     for step in steps:
         rows = [line for line in lines if line.startswith(f"| {step.number} |")]
         written = [row.split(" | ")[-3] for row in rows]
-        assert written == [str(statement.threshold) for statement in step.statements()], step.number
+        assert written == [str(criterion.threshold) for criterion in step.criteria.values()], step.number
     count = sum(len(step.limits) for step in steps)
     passed = sum(line.endswith("| PASS |") for line in lines)
     assert f"{len(steps)} steps pass, {passed} of {count} criteria" in "\n".join(lines)

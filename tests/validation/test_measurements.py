@@ -98,13 +98,13 @@ def test_all_steps_load_and_have_what_the_table_needs(scale):
     steps = [step for step, _ in load_ladder(scale=scale).steps]
     assert len(steps) == 13
     for step in steps:
-        assert step.statements()
-        assert all(item.why and item.quantity and item.sentence for item in step.statements())
+        assert step.criteria
+        assert all(item.why and item.quantity and item.sentence for item in step.criteria.values())
 
 
 def test_full_scale_thresholds_are_those_of_the_table():
-    statements = [statement for step, _ in load_ladder().steps for statement in step.statements()]
-    must = {statement.name: str(statement.threshold) for statement in statements}
+    criteria = [criterion for step, _ in load_ladder().steps for criterion in step.criteria.values()]
+    must = {criterion.name: str(criterion.threshold) for criterion in criteria}
     assert must["-1 double_pyuvsim"] == "<= 1e-06"
     assert must["0.0 scatter_over_theory"] == "1 within 3 sigma"
     assert must["0.1 normalization"] == "from 0.99 to 1.01"
@@ -126,7 +126,11 @@ def test_full_scale_thresholds_are_those_of_the_table():
 
 def test_small_scale_has_limits_of_its_own_only_where_a_step_says_so():
     full, small = (
-        {item.name: str(item.threshold) for step, _ in load_ladder(scale=scale).steps for item in step.statements()}
+        {
+            item.name: str(item.threshold)
+            for step, _ in load_ladder(scale=scale).steps
+            for item in step.criteria.values()
+        }
         for scale in SCALES
     )
     assert full.keys() - small.keys() == {"1.0 excess"}

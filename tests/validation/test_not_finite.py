@@ -12,6 +12,7 @@ from observations import small_instrument
 
 from calstudy.base.files import json_number
 from calstudy.base.visibilities import flag_cube, from_cube, to_cube
+from calstudy.claims import bins
 from calstudy.instrument.telescope import make_template
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.validation.step import STEPS, Findings, Step, largest, mean_over
@@ -148,7 +149,7 @@ def test_bins_without_a_number_in_the_residual_are_misses():
 def test_an_artefact_without_a_number_is_not_removed(monkeypatch):
     spectra = {"residual": spectrum(np.array([0.0, NAN, 0.0])), "uncalibrated": spectrum(np.ones(3))}
     run = SimpleNamespace(spherical=lambda variant, _modes: spectra[variant], experiment=None)
-    monkeypatch.setattr(noisy_calibration, "reflection_bins", lambda *items: np.isfinite(items[-1].power.real))
+    monkeypatch.setattr(bins, "reflection_bins", lambda *items: np.isfinite(items[-1].power.real))
     step = STEPS.make({"kind": "low-snr"})
     assert verdicts(step, step.measure({"lowsnr": run}, Path())) == {"left": "not evaluated", "artefact_sigmas": "PASS"}
 

@@ -84,8 +84,8 @@ def test_the_step_of_the_page_can_be_measured():
     Path(name).write_text(text)
     ladder = load_ladder([name], "small")
     assert list(ladder.measurements) == ["0.3"]
-    (statement,) = ladder.steps[0][0].statements()
-    assert str(statement.threshold) == "0.5 within 3 sigma"
+    (criterion,) = ladder.steps[0][0].criteria.values()
+    assert str(criterion.threshold) == "0.5 within 3 sigma"
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,11 @@ from calstudy.corrupt.noise import NoNoise, RadiometerNoise
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.as_built import AsBuilt
 from calstudy.instrument.beam_models.tables import MwaEmbeddedBeam
+from calstudy.verdicts.statement import Statement
 
 if TYPE_CHECKING:
     from calstudy.claims.realizations import PooledResults
     from calstudy.results.reader import Results
-    from calstudy.verdicts.statement import Statement
-
 
 REDUNDANT_FROM = 0.5
 """Fraction of baselines with a redundant partner from which an array is redundant."""
@@ -74,19 +73,13 @@ class Calamity2022(Paper):
     }
 
     def statements(self) -> Sequence[Statement]:
-        """Return the statements, in the order of the paper's sections."""
         from calstudy.papers.calamity2022 import calibration, computation, method, redundant, window
-        from calstudy.verdicts.statement import Statement
 
         modules = (method, calibration, window, redundant, computation)
         return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return in words an unsuitable setting of an experiment for a role, or None.
-
-        Defaults of experiments are the paper's values, except for the weights. Antennas, channels, integrations and
-        sources may be fewer, and substitutions for the sky and the beam are written with the results.
-        """
+        """Return in words a setting that is not the paper's, which is the default of all but the weights, or None."""
         if role == "run_time":
             return "an experiment measures no run times"
         checks = (
@@ -104,7 +97,6 @@ class Calamity2022(Paper):
         return _other_solver(experiment) if found is None and role != study else found
 
     def refusal_of_run(self, role: str, results: Results | PooledResults) -> str | None:
-        """Return in words an unsuitable setting of a run, or property of its array, for a role, or None."""
         refusal, study = self.refusal(role, results.experiment), _study(role)
         if refusal is not None or study == "low_snr":
             return refusal
@@ -118,7 +110,6 @@ class Calamity2022(Paper):
         return f"too {verdict} of the baselines have a redundant partner ({100 * fraction:.0f} %)"
 
     def substitutions(self, experiment: Experiment) -> tuple[str, ...]:
-        """Return one short sentence for each ingredient that an experiment uses in place of the paper's own."""
         return tuple(note for note in (_sky(experiment), _beam(experiment), _scale(experiment)) if note)
 
 
@@ -166,7 +157,6 @@ def _other_noise(role: str, experiment: Experiment) -> str | None:
 
 
 def _other_data(role: str, experiment: Experiment) -> str | None:
-    del role
     if experiment.instrument.as_built != AsBuilt():
         return "instrument.as_built is set: the paper's antennas are as designed"
     if experiment.corruption.eor_level != EOR_LEVEL:
@@ -177,7 +167,6 @@ def _other_data(role: str, experiment: Experiment) -> str | None:
 
 
 def _other_sky(role: str, experiment: Experiment) -> str | None:
-    del role
     if experiment.sky.diffuse.kind != "none":
         return f"sky.diffuse is {experiment.sky.diffuse.kind!r}, and the paper's sky has sources alone"
     return _changed(experiment.sky.eor, "sky.eor", ("nside", "seed"))
@@ -206,7 +195,6 @@ def _solver(experiment: Experiment) -> Solver | None:
 
 
 def _too_few_steps(role: str, experiment: Experiment) -> str | None:
-    del role
     solver = _solver(experiment)
     if isinstance(solver, AdamaxSettings) and solver.max_steps < LEAST_STEPS:
         return f"calibration.solver.max_steps is {solver.max_steps}, and {solver.name} takes thousands of steps"
@@ -219,8 +207,8 @@ def _other_solver(experiment: Experiment) -> str | None:
     if not isinstance(solver, AdamaxSettings) or solver.learning_rate != PAPER_RATE:
         return f"calibration.solver is not the paper's (adamax at a constant rate of {PAPER_RATE})"
     for name, wanted in (("keep", "last"), ("precision", "single")):
-        if getattr(solver, name) != wanted:
-            return f"calibration.solver.{name} is {getattr(solver, name)!r}, not the paper's {wanted!r}"
+        if (found := getattr(solver, name)) != wanted:
+            return f"calibration.solver.{name} is {found!r}, not the paper's {wanted!r}"
     if solver.max_steps < PAPER_STEPS:
         return f"calibration.solver.max_steps is {solver.max_steps}, not the paper's {PAPER_STEPS}"
     if solver.stop != "published" and solver.tolerance > 0:
@@ -260,14 +248,13 @@ def _own_beam(experiment: Experiment) -> str | None:
 
 def _scale(experiment: Experiment) -> str | None:
     instrument = experiment.instrument
-    reductions = []
-    if instrument.channels.count < PAPER_CHANNELS:
-        reductions.append(f"{instrument.channels.count} of {PAPER_CHANNELS} channels")
-    if instrument.times.count < PAPER_TIMES:
-        reductions.append(f"{instrument.times.count} of {PAPER_TIMES} integrations")
-    antennas = getattr(instrument.layout, "count", None)
-    if antennas is not None and antennas < PAPER_ANTENNAS:
-        reductions.append(f"{antennas} of {PAPER_ANTENNAS} antennas")
+    counts = (
+        (instrument.channels.count, PAPER_CHANNELS, "channels"),
+        (instrument.times.count, PAPER_TIMES, "integrations"),
+        (getattr(instrument.layout, "count", None), PAPER_ANTENNAS, "antennas"),
+    )
+    fewer = ((count, papers, noun) for count, papers, noun in counts if count is not None and count < papers)
+    reductions = [f"{count} of {papers} {noun}" for count, papers, noun in fewer]
     if experiment.sky.eor.nside < PAPER_NSIDE:
         reductions.append(f"EoR nside {experiment.sky.eor.nside} of {PAPER_NSIDE}")
     sources = getattr(experiment.sky.foregrounds, "count", None)

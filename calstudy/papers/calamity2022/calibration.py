@@ -11,10 +11,12 @@ from calstudy.verdicts.statement import Sentence, Source
 RESULTS = Source("Simulation Results", ("minimally_redundant",))
 SIMULATED = replace(RESULTS, tests_simulation=True)
 FACTOR_OF_TWO = "the paper's 'similar', 'about' and 'roughly' are read as within a factor of two"
+TWOFOLD = (Within(0.5, 2), FACTOR_OF_TWO)
+ORDER_10_PERCENT = (Within(0.05, 0.2), FACTOR_OF_TWO)
+ORDER_10_TO_20_PERCENT = (Within(0.05, 0.4), FACTOR_OF_TWO)
 
 
 def median(run: Results, name: str) -> Finding:
-    """Return the median over antennas or baselines, with their scatter."""
     found = run.measured(name)
     return Finding(found.value, found.scatter, "scatter")
 
@@ -60,9 +62,7 @@ def gains_within_20_percent_at_every_delay(run: Results) -> Finding:
     return median(run, "gains_worst_delay")
 
 
-@RESULTS.states(
-    GAINS_CAPTION, "rms of g - ĝ over rms of g, free of phase and scale; median", Within(0.05, 0.2), FACTOR_OF_TWO
-)
+@RESULTS.states(GAINS_CAPTION, "rms of g - ĝ over rms of g, free of phase and scale; median", *ORDER_10_PERCENT)
 def gains_of_order_10_percent(run: Results) -> Finding:
     return median(run, "gains_aligned")
 
@@ -75,8 +75,7 @@ GAINS_BY_DELAY = Sentence(
 @RESULTS.states(
     GAINS_BY_DELAY,
     "rms over antennas of the transform of g - ĝ over that of g (Blackman-Harris), gains as fitted; median of delays",
-    Within(0.05, 0.2),
-    FACTOR_OF_TWO,
+    *ORDER_10_PERCENT,
 )
 def gains_of_order_10_percent_at_typical_delay(run: Results) -> Finding:
     return median(run, "gains_raw_by_delay")
@@ -85,8 +84,7 @@ def gains_of_order_10_percent_at_typical_delay(run: Results) -> Finding:
 @RESULTS.states(
     GAINS_BY_DELAY,
     "rms over antennas of the transform of g - ĝ over that of g (Blackman-Harris), gains as fitted; at the worst delay",
-    Within(0.05, 0.2),
-    FACTOR_OF_TWO,
+    *ORDER_10_PERCENT,
 )
 def gains_of_order_10_percent_at_every_delay(run: Results) -> Finding:
     return median(run, "gains_raw_worst_delay")
@@ -96,14 +94,13 @@ def gains_of_order_10_percent_at_every_delay(run: Results) -> Finding:
     GAINS_BY_DELAY,
     "rms over antennas of the transform of g - ĝ over that of g (Blackman-Harris), free of phase and scale that no fit "
     "can know; median of delays",
-    Within(0.05, 0.2),
-    FACTOR_OF_TWO,
+    *ORDER_10_PERCENT,
 )
 def gains_of_order_10_percent_at_typical_delay_aligned(run: Results) -> Finding:
     return median(run, "gains_by_delay")
 
 
-@RESULTS.states(GAINS_CAPTION, "rms of g - ĝ over rms of g, gains as fitted; median", Within(0.05, 0.2), FACTOR_OF_TWO)
+@RESULTS.states(GAINS_CAPTION, "rms of g - ĝ over rms of g, gains as fitted; median", *ORDER_10_PERCENT)
 def gains_of_order_10_percent_raw(run: Results) -> Finding:
     return median(run, "gains_raw")
 
@@ -114,14 +111,12 @@ MODEL = Sentence(
 )
 
 
-@RESULTS.states(
-    MODEL, "rms of F - F̂ over rms of F, on the scale of the true gains; median", Within(0.05, 0.4), FACTOR_OF_TWO
-)
+@RESULTS.states(MODEL, "rms of F - F̂ over rms of F, on the scale of the true gains; median", *ORDER_10_TO_20_PERCENT)
 def model_of_order_10_to_20_percent(run: Results) -> Finding:
     return median(run, "model_aligned")
 
 
-@RESULTS.states(MODEL, "rms of F - F̂ over rms of F, model as fitted; median", Within(0.05, 0.4), FACTOR_OF_TWO)
+@RESULTS.states(MODEL, "rms of F - F̂ over rms of F, model as fitted; median", *ORDER_10_TO_20_PERCENT)
 def model_of_order_10_to_20_percent_raw(run: Results) -> Finding:
     return median(run, "model_raw")
 
@@ -141,8 +136,7 @@ PRODUCT = Sentence(
 @RESULTS.states(
     "the products of the gains and foregrounds are identical to within the uncertainties from thermal noise",
     "rms of V - ĝĝ*F̂ over rms of the noise in V; median",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
 )
 def product_at_noise(run: Results) -> Finding:
     return median(run, "product_over_noise")
@@ -185,8 +179,7 @@ def correction_is_smooth(run: Results) -> Finding:
 @RESULTS.states(
     "outside of the wedge, the RMS amplitudes of our calibrated residuals are reasonably consistent with thermal noise",
     "rms over time of R over that of N, delays outside the wedge; median",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
 )
 def residual_at_noise_outside_wedge(run: Results) -> Finding:
     return median(run, "residual_over_noise_outside")

@@ -15,10 +15,10 @@ from calstudy.verdicts.statement import Sentence, Source, Unevaluated
 
 COMPUTATION = Source("Computational Runtime", ("run_time",))
 QUARTER = 0.25
-QUADRATIC, LINEAR, CONSTANT = (Within(power - QUARTER, power + QUARTER) for power in (2, 1, 0))
-QUARTER_WHY = "the exponent, to a quarter"
+QUADRATIC, LINEAR, CONSTANT = (
+    (Within(power - QUARTER, power + QUARTER), "the exponent, to a quarter") for power in (2, 1, 0)
+)
 HUNDREDS = 300
-"""Number of antennas for the text's "hundreds"."""
 MINUTES = AtMost(600)
 THOUSANDS_OF_ANTENNAS = 3000
 AROUND_HUNDRED = 100
@@ -47,16 +47,13 @@ QUADRATIC_SENTENCE = Sentence(
 @COMPUTATION.states(
     QUADRATIC_SENTENCE,
     "exponent of the median time of the paper's step against the number of antennas, one core",
-    QUADRATIC,
-    QUARTER_WHY,
+    *QUADRATIC,
 )
 def paper_step_quadratic_in_antennas(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("rows", "paper-step"))
 
 
-@COMPUTATION.states(
-    QUADRATIC_SENTENCE, "the same of this project's own Adamax step, without padding", QUADRATIC, QUARTER_WHY
-)
+@COMPUTATION.states(QUADRATIC_SENTENCE, "the same of this project's own Adamax step, without padding", *QUADRATIC)
 def own_step_quadratic_in_antennas(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("rows", "adamax-step"))
 
@@ -70,8 +67,7 @@ LINEAR_SENTENCE = Sentence(
 @COMPUTATION.states(
     LINEAR_SENTENCE,
     "exponent of the median time of the paper's step against the longest baseline, 10 antennas, one core",
-    LINEAR,
-    QUARTER_WHY,
+    *LINEAR,
 )
 def paper_step_linear_in_longest_baseline(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step"))
@@ -80,8 +76,7 @@ def paper_step_linear_in_longest_baseline(run: RunTimeTable) -> Finding:
 @COMPUTATION.states(
     LINEAR_SENTENCE,
     "the same against the number of foreground vectors of the longest baseline, which the buffer keeps above zero",
-    LINEAR,
-    QUARTER_WHY,
+    *LINEAR,
 )
 def paper_step_linear_in_vectors(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step", "vectors"))
@@ -113,8 +108,7 @@ def basis_dominates_memory(run: RunTimeTable) -> Finding:
 @COMPUTATION.states(
     MEMORY_SENTENCE,
     "exponent of the memory that the paper's step takes against the bytes of A, over the arrays in rows",
-    LINEAR,
-    QUARTER_WHY,
+    *LINEAR,
 )
 def memory_grows_like_basis(run: RunTimeTable) -> Finding:
     return _exponent(fit_power_law(run.column("rows", "basis_bytes"), run.column("rows", "paper_memory")))
@@ -124,19 +118,15 @@ THOUSANDS_SENTENCE = Sentence(
     "thousands-of-steps",
     "given a learning rate of 0.01, CALAMITY requires thousands of gradient descent steps to converge",
 )
-THOUSANDS, THOUSANDS_WHY = Within(1e3, 1e4), "thousands, not hundreds or tens of thousands"
+THOUSANDS = (Within(1e3, 1e4), "thousands, not hundreds or tens of thousands")
 
 
-@COMPUTATION.states(
-    THOUSANDS_SENTENCE, "steps until the loss is within 5 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
-)
+@COMPUTATION.states(THOUSANDS_SENTENCE, "steps until the loss is within 5 % of its minimum, one array", *THOUSANDS)
 def thousands_of_steps_to_five_percent(run: RunTimeTable) -> Finding:
     return run.steps_to("0.05")
 
 
-@COMPUTATION.states(
-    THOUSANDS_SENTENCE, "steps until the loss is within 1 % of its minimum, one array", THOUSANDS, THOUSANDS_WHY
-)
+@COMPUTATION.states(THOUSANDS_SENTENCE, "steps until the loss is within 1 % of its minimum, one array", *THOUSANDS)
 def thousands_of_steps_to_one_percent(run: RunTimeTable) -> Finding:
     return run.steps_to("0.01")
 
@@ -167,8 +157,7 @@ def gpu_step_at_hundred_antennas(run: RunTimeTable) -> Finding:
 @COMPUTATION.states(
     "the run time on the GPU appears constant",
     "exponent of the median time of the paper's step against the longest baseline, 10 antennas, GPU",
-    CONSTANT,
-    QUARTER_WHY,
+    *CONSTANT,
 )
 def gpu_step_constant_in_longest_baseline(run: RunTimeTable) -> Finding:
     return _exponent(run.scaling("line", "paper-step", device="gpu"))

@@ -8,10 +8,10 @@ from scipy.spatial.distance import pdist
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.calibrate.basis import delay_half_widths, make_basis
 from calstudy.calibrate.settings import ForegroundFit
-from calstudy.claims.bins import mean_of_common_errors
+from calstudy.claims.bins import mean_of_common_errors, median_and_scatter
 from calstudy.claims.realizations import PooledResults
 from calstudy.instrument.layouts import make_array
-from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO
+from calstudy.papers.calamity2022.calibration import TWOFOLD
 from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtMost, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
@@ -41,16 +41,11 @@ def _vectors_over_bandwidth(run: Results, buffered: bool) -> Finding:
     for bucket in make_basis(lengths, frequencies, calibration.basis).buckets:
         vectors[bucket.members] = bucket.vectors.shape[1]
     delay = delay_half_widths(lengths, calibration.basis) if buffered else lengths / SPEED_OF_LIGHT
-    found = vectors / (2 * channels.count * channels.width * delay)
-    low, middle, high = np.quantile(found, [0.16, 0.5, 0.84])
-    return Finding(float(middle), float(high - low) / 2, "scatter")
+    return median_and_scatter(vectors / (2 * channels.count * channels.width * delay))
 
 
 @METHOD.states(
-    VECTORS,
-    "vectors of a baseline over its W with the light travel time between its antennas as τ; median",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    VECTORS, "vectors of a baseline over its W with the light travel time between its antennas as τ; median", *TWOFOLD
 )
 def vectors_like_bandwidth_of_horizon(run: Results) -> Finding:
     return _vectors_over_bandwidth(run, buffered=False)
@@ -59,8 +54,7 @@ def vectors_like_bandwidth_of_horizon(run: Results) -> Finding:
 @METHOD.states(
     VECTORS,
     "vectors of a baseline over its W with the largest delay that is modelled as τ, buffer included; median",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
 )
 def vectors_like_bandwidth_of_basis(run: Results) -> Finding:
     return _vectors_over_bandwidth(run, buffered=True)

@@ -7,22 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
-from calstudy.claims.bins import (
-    SEEN,
-    TINY,
-    difference_of_losses,
-    fraction_within,
-    mean_of_common_errors,
-    ratio,
-    recovered_outside_wedge,
-    reflection_bins,
-    rms_power,
-    rms_without_eor,
-    used_bins,
-)
+from calstudy.claims import bins
 from calstudy.claims.realizations import PooledResults, of_one_draw, over_realizations
-from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, median
-from calstudy.papers.calamity2022.window import ONE_DRAW, TENTH, TENTH_WHY, UNBIASED, agreement
+from calstudy.papers.calamity2022.calibration import TWOFOLD, median
+from calstudy.papers.calamity2022.window import ONE_DRAW, TENTH, UNBIASED, agreement
 from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
 from calstudy.verdicts.statement import Sentence, Source, Unevaluated
@@ -33,13 +21,14 @@ K_MIN = 0.2
 K_LOSS = 0.3
 """Wavenumber up to which the paper sees more loss for the redundant array, h/Mpc."""
 NO_EFFECT = 0.05
+HIGHER = (AtLeast(0, 2), "higher beyond the errors")
 
 
 def _lower(name: str, first: Results, second: Results) -> Finding:
     """Return rms P of a variant in the first run over that in the second, outside the wedge, k >= 0.2."""
     spectra = [run.spherical(name, "outside-wedge") for run in (first, second)]
-    used = used_bins(*spectra, k_min=K_MIN)
-    return ratio(*(rms_power(spectrum, used) for spectrum in spectra))
+    used = bins.used_bins(*spectra, k_min=K_MIN)
+    return bins.ratio(*(bins.rms_power(spectrum, used) for spectrum in spectra))
 
 
 SUPPRESSED = Sentence(
@@ -56,7 +45,7 @@ SUPPRESSED = Sentence(
 )
 def uncalibrated_systematics_suppressed(minimal: Results, redundant: Results) -> Finding:
     spectra = [run.spherical("uncalibrated", "outside-wedge") for run in (minimal, redundant)]
-    used = used_bins(*spectra, k_min=K_MIN)
+    used = bins.used_bins(*spectra, k_min=K_MIN)
     first, second = (np.abs(spectrum.power.real[used]) for spectrum in spectra)
     scatter = np.std(np.log(first / second)) / np.sqrt(used.sum())
     value = float(np.median(first) / np.median(second))
@@ -72,8 +61,8 @@ def uncalibrated_systematics_suppressed(minimal: Results, redundant: Results) ->
 )
 def calibrated_systematics_suppressed(minimal: Results, redundant: Results) -> Finding:
     spectra = [run.spherical("residual_without_eor", "outside-wedge") for run in (minimal, redundant)]
-    used = used_bins(*spectra, k_min=K_MIN)
-    return ratio(*(rms_without_eor(run, used) for run in (minimal, redundant)))
+    used = bins.used_bins(*spectra, k_min=K_MIN)
+    return bins.ratio(*(bins.rms_without_eor(run, used) for run in (minimal, redundant)))
 
 
 @SIMULATED.states(
@@ -107,50 +96,46 @@ def redundant_signal_recovered(redundant: Results) -> Finding:
 @REDUNDANT.states(
     UNBIASED,
     "mean P^R/P^S of the redundant array outside the wedge at k >= 0.3",
-    TENTH,
-    TENTH_WHY,
+    *TENTH,
     roles=("redundant",),
     pooled=over_realizations("ratio", "outside-wedge", K_LOSS),
 )
 def redundant_residual_relatively_unbiased(redundant: Results) -> Finding:
-    return recovered_outside_wedge(redundant, K_LOSS)
+    return bins.recovered_outside_wedge(redundant, K_LOSS)
 
 
 @REDUNDANT.states(
     HIGHER_LOSS,
     "C s, the fraction of the EoR that is left, of the minimally redundant array minus that of the redundant one, bin "
     "by bin, outside the wedge, k < 0.3",
-    AtLeast(0, 2),
-    "higher beyond the errors",
+    *HIGHER,
 )
 def less_of_the_eor_below_0p3(minimal: Results, redundant: Results) -> Finding:
     first, second = (run.transfer("outside-wedge") for run in (minimal, redundant))
     difference = first.flux_scale * first.cross_transfer - second.flux_scale * second.cross_transfer
     error = np.hypot(first.flux_scale * first.cross_transfer_error, second.flux_scale * second.cross_transfer_error)
-    below = first.k < K_LOSS - TINY
-    return mean_of_common_errors(difference[below], error[below])
+    below = first.k < K_LOSS - bins.TINY
+    return bins.mean_of_common_errors(difference[below], error[below])
 
 
 @REDUNDANT.states(
     HIGHER_LOSS,
     "T free of the flux scale of the minimally redundant array minus that of the redundant one, bin by bin, outside "
     "the wedge, k < 0.3",
-    AtLeast(0, 2),
-    "higher beyond the errors",
+    *HIGHER,
 )
 def more_loss_of_power_below_0p3(minimal: Results, redundant: Results) -> Finding:
-    return difference_of_losses(minimal, redundant, 0.0, K_LOSS - TINY)
+    return bins.difference_of_losses(minimal, redundant, 0.0, K_LOSS - bins.TINY)
 
 
 @REDUNDANT.states(
     "fewer independent realizations are averaged down in each gain solution, which increases signal loss on all scales",
     "T free of the flux scale of the minimally redundant array minus that of the redundant one, bin by bin, outside "
     "the wedge, k >= 0.3",
-    AtLeast(0, 2),
-    "higher beyond the errors",
+    *HIGHER,
 )
 def more_loss_on_all_scales_without_flux_scale(minimal: Results, redundant: Results) -> Finding:
-    return difference_of_losses(minimal, redundant, K_LOSS)
+    return bins.difference_of_losses(minimal, redundant, K_LOSS)
 
 
 def _longer_extent(minimal: PooledResults, redundant: PooledResults) -> Finding:
@@ -178,21 +163,19 @@ SAME = Sentence("same-residual", "we get roughly the same residual when calibrat
 @REDUNDANT.states(
     SAME,
     "rms R over N outside the wedge with one model per group over that with one per baseline; median",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
     roles=("redundant", "redundant_modelling"),
 )
 def redundant_modelling_same_visibilities(redundant: Results, modelling: Results) -> Finding:
     per_baseline, per_group = (run.measured("residual_over_noise_outside") for run in (redundant, modelling))
-    found = ratio(Finding(per_group.value, per_group.scatter), Finding(per_baseline.value, per_baseline.scatter))
+    found = bins.ratio(Finding(per_group.value, per_group.scatter), Finding(per_baseline.value, per_baseline.scatter))
     return found._replace(kind="scatter")
 
 
 @REDUNDANT.states(
     SAME,
     "rms P^R with one model per group over that with one per baseline, outside the wedge, k >= 0.2",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
     roles=("redundant", "redundant_modelling"),
 )
 def redundant_modelling_same_power(redundant: Results, modelling: Results) -> Finding:
@@ -208,19 +191,18 @@ def redundant_modelling_same_power(redundant: Results, modelling: Results) -> Fi
     roles=("redundant", "redundant_modelling"),
 )
 def redundant_modelling_loses_the_same(redundant: Results, modelling: Results) -> Finding:
-    return difference_of_losses(modelling, redundant, 0.0, K_LOSS - TINY)
+    return bins.difference_of_losses(modelling, redundant, 0.0, K_LOSS - bins.TINY)
 
 
 LOW_SNR = Source("The Low Signal-to-Noise regime", ("low_snr",))
 REFLECTED = replace(LOW_SNR, tests_simulation=True)
-TENFOLD = Within(10**0.5, 10**1.5)
-TENFOLD_WHY = "≈ 10, to half an order of magnitude"
+TENFOLD = (Within(10**0.5, 10**1.5), "≈ 10, to half an order of magnitude")
 
 
 def _artefact(run: Results) -> float:
     """Return the ratio of the artefact to the noise in the average of all integrations."""
     spectrum = run.spherical("uncalibrated", "outside-wedge")
-    chosen = reflection_bins(run, run.experiment, spectrum)
+    chosen = bins.reflection_bins(run, run.experiment, spectrum)
     return float(np.max(spectrum.power.real[chosen] / spectrum.noise_error[chosen]))
 
 
@@ -240,12 +222,12 @@ def artefact_visible_above_noise(run: Results) -> Finding:
     return Finding(_artefact(run), 1.0)
 
 
-@REFLECTED.states(ARTEFACT, "largest P^V near 1200 ns over the standard deviation of the noise", TENFOLD, TENFOLD_WHY)
+@REFLECTED.states(ARTEFACT, "largest P^V near 1200 ns over the standard deviation of the noise", *TENFOLD)
 def artefact_tenfold_above_noise(run: Results) -> Finding:
     return Finding(_artefact(run), 1.0)
 
 
-@REFLECTED.states(ARTEFACT, "largest P^V near 1200 ns over the 95 % level of the noise", TENFOLD, TENFOLD_WHY)
+@REFLECTED.states(ARTEFACT, "largest P^V near 1200 ns over the 95 % level of the noise", *TENFOLD)
 def artefact_tenfold_above_noise_bars(run: Results) -> Finding:
     return Finding(_artefact(run) / SIGMAS_95, 1 / SIGMAS_95)
 
@@ -264,8 +246,7 @@ def _of_one_integration(run: Results) -> float:
     ARTEFACT,
     "largest P^V near 1200 ns over the standard deviation of the noise of a single integration, without the coherent "
     "average",
-    TENFOLD,
-    TENFOLD_WHY,
+    *TENFOLD,
 )
 def artefact_tenfold_above_noise_of_one_integration(run: Results) -> Finding:
     return Finding(_artefact(run) / _of_one_integration(run), 1 / _of_one_integration(run))
@@ -274,8 +255,7 @@ def artefact_tenfold_above_noise_of_one_integration(run: Results) -> Finding:
 @REFLECTED.states(
     ARTEFACT,
     "largest P^V near 1200 ns over the 95 % level of the noise of a single integration, without the coherent average",
-    TENFOLD,
-    TENFOLD_WHY,
+    *TENFOLD,
 )
 def artefact_tenfold_above_noise_bars_of_one_integration(run: Results) -> Finding:
     unit = SIGMAS_95 * _of_one_integration(run)
@@ -295,12 +275,8 @@ REMOVED = Sentence(
     "removed is an order of magnitude at least, to half an order",
 )
 def artefact_removed(run: Results) -> Finding:
-    before, after = (run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual"))
-    chosen = reflection_bins(run, run.experiment, after)
-    weights = after.noise_error[chosen] ** -2.0
-    artefact, left = (float(np.sum(weights * item.power.real[chosen]) / weights.sum()) for item in (before, after))
-    sigma = float(weights.sum() ** -0.5)
-    if artefact < SEEN * sigma:
+    artefact, left, sigma = bins.at_reflections(run, run.experiment, "residual")
+    if artefact < bins.SEEN * sigma:
         raise Unevaluated("there is no artefact before the calibration that could be removed")
     return Finding(left / artefact, sigma / artefact)
 
@@ -312,9 +288,8 @@ def artefact_removed(run: Results) -> Finding:
     "95 % by chance alone; a tenth may miss",
 )
 def residual_consistent_with_noise(run: Results) -> Finding:
-    spectrum = run.spherical("residual", "outside-wedge")
-    used = used_bins(spectrum, k_min=0.2)
-    return fraction_within(spectrum.power.real[used], spectrum.noise_error[used])
+    used, (spectrum,) = bins.outside_wedge(run, "residual", k_min=K_MIN)
+    return bins.fraction_within(spectrum.power.real[used], spectrum.noise_error[used])
 
 
 SINGLE = Sentence(
@@ -323,11 +298,11 @@ SINGLE = Sentence(
 )
 
 
-@REFLECTED.states(SINGLE, "rms of V over that of N, delays outside the wedge; median", Within(0.5, 2), FACTOR_OF_TWO)
+@REFLECTED.states(SINGLE, "rms of V over that of N, delays outside the wedge; median", *TWOFOLD)
 def data_at_noise_on_single_baseline(run: Results) -> Finding:
     return median(run, "data_over_noise_outside")
 
 
-@LOW_SNR.states(SINGLE, "rms of R over that of N, delays outside the wedge; median", Within(0.5, 2), FACTOR_OF_TWO)
+@LOW_SNR.states(SINGLE, "rms of R over that of N, delays outside the wedge; median", *TWOFOLD)
 def residual_at_noise_on_single_baseline(run: Results) -> Finding:
     return median(run, "residual_over_noise_outside")

@@ -4,19 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calstudy.claims.bins import (
-    fraction_within,
-    power_without_eor,
-    pull_without_eor,
-    ratio,
-    recovered,
-    recovered_outside_wedge,
-    rms_without_eor,
-    used_bins,
-)
+from calstudy.claims import bins
 from calstudy.claims.realizations import PooledResults, of_one_draw, over_realizations
-from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS, SIMULATED
-from calstudy.power.delay import horizon_delay
+from calstudy.papers.calamity2022.calibration import FACTOR_OF_TWO, RESULTS, SIMULATED, TWOFOLD
 from calstudy.power.spectra import CylindricalSpectrum
 from calstudy.results.reader import Results
 from calstudy.verdicts.criterion import AtLeast, AtMost, Finding, Within
@@ -27,18 +17,11 @@ K_AGREEMENT = 0.2
 K_BIAS = 0.25
 K_SMALL = 0.5
 """The paper's 'small k values', h/Mpc, where there is signal and not only noise."""
-MAIN_LOBE = 4
-"""Half-width of the Blackman-Harris main lobe in units of 1 / bandwidth."""
 
 
 def window(run: Results, wedge: CylindricalSpectrum) -> np.ndarray:
-    """Return which modes are beyond horizon and buffer, or the taper's main lobe if that is wider, (Nb, Nd) bool.
-
-    The horizon is that of the longest baseline of each bin.
-    """
-    bandwidth = 1 / (wedge.delay[1] - wedge.delay[0])
-    horizon = horizon_delay(wedge.bin_edges[:, 1])
-    chosen = wedge.delay > horizon[:, None] + max(run.experiment.power.wedge_buffer, MAIN_LOBE / bandwidth)
+    """Return which modes are beyond the wedge of the longest baseline of each bin of lengths, (Nb, Nd) bool."""
+    chosen = bins.beyond_wedge(wedge.delay, wedge.bin_edges[:, 1], run.experiment.power.wedge_buffer)
     if not chosen.any():
         raise Unevaluated("no delays outside the wedge")
     return chosen
@@ -54,8 +37,7 @@ def _row_ratio(run: Results, above: str, below: tuple[str, ...]) -> Finding:
     upper = run.wedge(above)
     chosen = window(run, upper)
     total = sum(_rows(run.wedge(name).power.real, chosen) for name in below)
-    low, middle, high = np.quantile(_rows(upper.power.real, chosen) / total, [0.16, 0.5, 0.84])
-    return Finding(float(middle), float(high - low) / 2, "scatter")
+    return bins.median_and_scatter(_rows(upper.power.real, chosen) / total)
 
 
 FILLED = Sentence("window-filled", "the entire EoR window is filled in with systematics")
@@ -142,10 +124,9 @@ def calibrated_window_consistent(run: Results) -> Finding:
 
 def agreement(run: Results, k_min: float) -> Finding:
     """Return the part of the bins from `k_min` (h/Mpc) outside the wedge in which P^R is within 95 % errors of P^S."""
-    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual", "eor"))
-    used = used_bins(residual, signal, k_min=k_min)
+    used, (residual, signal) = bins.outside_wedge(run, "residual", "eor", k_min=k_min)
     power, eor, error = residual.power.real[used], signal.power.real[used], residual.error[used]
-    found, on_scale = (fraction_within(scale * power - eor, error) for scale in (1.0, run.score.flux_scale**2))
+    found, on_scale = (bins.fraction_within(scale * power - eor, error) for scale in (1.0, run.score.flux_scale**2))
     # All bins share the flux scale, which differs between draws.
     return found._replace(uncertainty=float(np.hypot(found.uncertainty, found.value - on_scale.value)))
 
@@ -159,7 +140,7 @@ UNBIASED = Sentence(
     "in both scenarios, it recovers relatively unbiased estimates of the power spectrum within the EoR window "
     "(Conclusion)",
 )
-TENTH, TENTH_WHY = Within(0.9, 1.1), "relatively unbiased: to a tenth"
+TENTH = (Within(0.9, 1.1), "relatively unbiased: to a tenth")
 
 
 @RESULTS.states(
@@ -175,23 +156,21 @@ def residual_agrees_outside_wedge(run: Results) -> Finding:
 @RESULTS.states(
     BROAD,
     "mean P^R/P^S outside the wedge at k >= 0.2",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_level_outside_wedge(run: Results) -> Finding:
-    return recovered_outside_wedge(run, K_AGREEMENT)
+    return bins.recovered_outside_wedge(run, K_AGREEMENT)
 
 
 @RESULTS.states(
     UNBIASED,
     "mean P^R/P^S outside the wedge at k >= 0.2",
-    TENTH,
-    TENTH_WHY,
+    *TENTH,
     pooled=over_realizations("ratio", "outside-wedge", K_AGREEMENT),
 )
 def residual_relatively_unbiased_outside_wedge(run: Results) -> Finding:
-    return recovered_outside_wedge(run, K_AGREEMENT)
+    return bins.recovered_outside_wedge(run, K_AGREEMENT)
 
 
 ONE_DRAW = "where a bias ends differs between draws by some bins; needs realizations"
@@ -207,7 +186,7 @@ BIAS_CAPTION = Sentence("biased-below-0p25", "our calibrated residual is biased 
     pooled=over_realizations("ratio", "all-modes", 0.0, K_BIAS),
 )
 def residual_biased_with_wedge(run: Results) -> Finding:
-    return recovered(run.spherical("residual", "all-modes"), run.spherical("eor", "all-modes"), 0.0, K_BIAS)
+    return bins.recovered(run.spherical("residual", "all-modes"), run.spherical("eor", "all-modes"), 0.0, K_BIAS)
 
 
 def _extent_with_wedge(run: PooledResults) -> Finding:
@@ -244,9 +223,8 @@ NOISE_ONLY = Sentence(
 
 
 def _without_eor(run: Results) -> Finding:
-    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
-    used = used_bins(residual, signal, k_min=K_AGREEMENT)
-    return ratio(rms_without_eor(run, used), Finding(float(np.mean(signal.power.real[used])), 0.0))
+    used, (_, signal) = bins.outside_wedge(run, "residual_without_eor", "eor", k_min=K_AGREEMENT)
+    return bins.ratio(bins.rms_without_eor(run, used), Finding(float(np.mean(signal.power.real[used])), 0.0))
 
 
 @RESULTS.states(
@@ -269,15 +247,13 @@ def residual_without_eor_lower_within_half_an_order(run: Results) -> Finding:
 @RESULTS.states(
     NOISE_ONLY,
     "rms of P^R without EoR, in units of its noise error, over the same of P^N; outside the wedge, k >= 0.2",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
 )
 def residual_without_eor_at_noise(run: Results) -> Finding:
-    residual, noise = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "noise"))
-    used = used_bins(residual, noise, k_min=K_AGREEMENT)
+    used, (residual, noise) = bins.outside_wedge(run, "residual_without_eor", "noise", k_min=K_AGREEMENT)
     of_noise = float(np.sqrt(np.mean((noise.power.real / noise.noise_error)[used] ** 2)))
-    left = rms_without_eor(run, used, residual.noise_error[used])
-    return ratio(left, Finding(of_noise, of_noise / np.sqrt(2 * used.sum())))
+    left = bins.rms_without_eor(run, used, residual.noise_error[used])
+    return bins.ratio(left, Finding(of_noise, of_noise / np.sqrt(2 * used.sum())))
 
 
 @RESULTS.states(
@@ -303,10 +279,9 @@ def residual_without_eor_neither_more_nor_less_than_90_db_below(run: Results) ->
 
 
 def _below_foregrounds(run: Results) -> Finding:
-    residual = run.spherical("residual_without_eor", "outside-wedge")
-    foregrounds = run.spherical("uncorrupted", "all-modes")
-    found = rms_without_eor(run, used_bins(residual, k_min=K_AGREEMENT))
-    highest = float(np.nanmax(foregrounds.power.real))
+    used, _ = bins.outside_wedge(run, "residual_without_eor", k_min=K_AGREEMENT)
+    found = bins.rms_without_eor(run, used)
+    highest = float(np.nanmax(run.spherical("uncorrupted", "all-modes").power.real))
     return Finding(10 * np.log10(found.value / highest), 10 / np.log(10) * found.uncertainty / found.value)
 
 
@@ -318,11 +293,10 @@ POSITIVE = Sentence(
 
 def _over_eor(run: Results, k_min: float, k_max: float, by_noise: bool = False) -> Finding:
     """Return the mean over bins of P^R without EoR, perhaps weighted `by_noise` variances, over that of P^S."""
-    residual, signal = (run.spherical(name, "outside-wedge") for name in ("residual_without_eor", "eor"))
-    used = used_bins(residual, signal, k_min=k_min, k_max=k_max)
+    used, (residual, signal) = bins.outside_wedge(run, "residual_without_eor", "eor", k_min=k_min, k_max=k_max)
     level = float(np.mean(signal.power.real[used]))
     weights = residual.noise_error[used] ** -2.0 if by_noise else np.ones(used.sum())
-    left = power_without_eor(run, used, weights)
+    left = bins.power_without_eor(run, used, weights)
     return Finding(left.value / level, left.uncertainty / level)
 
 
@@ -362,8 +336,7 @@ TAPERED = Sentence(
 )
 def residual_beats_taper_outside_wedge(run: Results) -> Finding:
     # With the modes of the wedge the tapered estimator has the foregrounds themselves, which any calibration beats.
-    tapered, residual, signal = (run.spherical(name, "outside-wedge") for name in ("uncorrupted", "residual", "eor"))
-    used = used_bins(tapered, residual, signal, k_max=K_BIAS)
+    used, (tapered, residual, signal) = bins.outside_wedge(run, "uncorrupted", "residual", "eor", k_max=K_BIAS)
     errors = [np.sqrt(np.mean((item.power - signal.power).real[used] ** 2)) for item in (tapered, residual)]
     # The ratio of few bins is uncertain by a factor, so that errors are symmetric in dB.
     return Finding(float(10 * np.log10(errors[0] / errors[1])), float(10 / np.log(10) / np.sqrt(used.sum())))
@@ -379,15 +352,13 @@ def _above(k: float) -> float:
 
 def _over_noise(run: Results, k_min: float, k_max: float) -> Finding:
     """Return the mean over bins of P^R without EoR in units of its noise error."""
-    residual = run.spherical("residual_without_eor", "outside-wedge")
-    return pull_without_eor(run, used_bins(residual, k_min=k_min, k_max=k_max))
+    return bins.pull_without_eor(run, bins.outside_wedge(run, "residual_without_eor", k_min=k_min, k_max=k_max)[0])
 
 
 @RESULTS.states(
     POSITIVE,
     "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k <= 0.2",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
     pooled=over_realizations("pull_without_eor", "outside-wedge", 0.0, K_AGREEMENT),
 )
 def bias_at_level_of_noise_below_0p2(run: Results) -> Finding:
@@ -397,8 +368,7 @@ def bias_at_level_of_noise_below_0p2(run: Results) -> Finding:
 @RESULTS.states(
     POSITIVE,
     "mean over bins of P^R without EoR in units of its noise error, outside the wedge, k from 0.2 to 0.5",
-    Within(0.5, 2),
-    FACTOR_OF_TWO,
+    *TWOFOLD,
     pooled=over_realizations("pull_without_eor", "outside-wedge", _above(K_AGREEMENT), K_SMALL),
 )
 def bias_at_level_of_noise_from_0p2_to_0p5(run: Results) -> Finding:

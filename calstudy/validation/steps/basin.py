@@ -9,7 +9,8 @@ at the true gains.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+import operator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -135,7 +136,6 @@ class BasinOfConvergence(SingleIntegrationStep):
     )
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Fit data with all these gain errors; write the table basin.csv and the figure."""
         integration = self.integration(runs)
         fits, floors = {}, []
         for error, delay in itertools.product(self.gain_errors, self.delays):
@@ -161,7 +161,7 @@ class BasinOfConvergence(SingleIntegrationStep):
         rows = [(*cell, record.status, record.steps, misfit, record.message) for cell, record, misfit in found]
         Table(COLUMNS, rows).write_csv(output / "basin.csv")
         save_figure(draw_basin(basin), figure_arrays(basin), output, "basin")
-        return Findings(_findings(basin), _remarks(basin))
+        return Findings(_findings(basin), tuple(_remarks(rows)))
 
 
 def _data(integration: SingleIntegration, error: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
@@ -176,7 +176,6 @@ def _data(integration: SingleIntegration, error: float, delay: float) -> tuple[n
 
 
 def _misfit(integration: SingleIntegration, result: CalibrationResult, visibilities: np.ndarray) -> float:
-    """Return the rms of V - g_a g_b* F, Jy."""
     return rms(integration.misfit(result, visibilities))
 
 
@@ -198,20 +197,13 @@ def _findings(basin: Basin) -> dict[str, Finding]:
     return found
 
 
-def _remarks(basin: Basin) -> tuple[str, ...]:
-    sentences = []
-    for start, error in itertools.product(range(len(basin.starts)), range(len(basin.gain_errors))):
-        cells = ", ".join(
-            f"{1e9 * delay:.0f} ns {misfit:.3g}{'' if said else ' (not converged)'}"
-            for delay, misfit, said in zip(
-                basin.delays, basin.misfit[start, error], basin.converged[start, error], strict=True
-            )
+def _remarks(rows: Sequence[tuple]) -> Iterator[str]:
+    for (start, error), cells in itertools.groupby(rows, key=operator.itemgetter(0, 1)):
+        told = ", ".join(
+            f"{1e9 * delay:.0f} ns {misfit:.3g}{'' if status == 'converged' else ' (not converged)'}"
+            for _, _, delay, status, _, misfit, _ in cells
         )
-        sentences.append(
-            f"from {basin.starts[start]}, gain error {basin.gain_errors[error]:g}, misfit over floor at delays up to "
-            f"{cells}"
-        )
-    return tuple(sentences)
+        yield f"from {start}, gain error {error:g}, misfit over floor at delays up to {told}"
 
 
 @style.journal_style()

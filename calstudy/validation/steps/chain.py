@@ -84,12 +84,10 @@ class EndToEnd(Step):
     }
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra of all variants, and the transfer function, if any, which has the flux scale."""
         transfer = signal_loss.transfer(graph)
         return {"spectra": spectra.spectra(graph), **({} if transfer is None else {"transfer": transfer})}
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare the spectrum of the residual with that of the EoR."""
         values, remarks = {}, []
         for name, run in runs.items():
             residual, signal = (run.spherical(variant, "outside-wedge") for variant in ("residual", "eor"))
@@ -156,7 +154,6 @@ class SignalLossBudget(Step):
     }
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the EoR before averaging, its transfer function, and spectra of EoR, response, and both residuals."""
         eor = Variant(components=("eor",))
         transfer = required(signal_loss.transfer(graph), "the variants of signal loss")
         return {
@@ -170,7 +167,6 @@ class SignalLossBudget(Step):
         }
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compute the budgets and write them to signal_loss_budget.csv."""
         values, remarks, rows = {}, [], []
         for name, run in runs.items():
             bands = budget(run)
@@ -205,25 +201,19 @@ def budget(run: StepInput) -> list[Band]:
     bands = []
     for low, high in itertools.pairwise(BANDS):
         inside = (k > low) & (k <= high)
-        if not (inside & outside).any():
+        both = inside & outside
+        if not both.any():
             continue
         put_in = float(run.input_power(np.array((low + high) / 2)))
-        powers = [1.0, *(_mean(modes, inside).value / put_in for modes in followed)]
-        after = _mean(response, inside).value / put_in
-        powers += [after * scale**2, after]
-        powers.append(_mean(response, inside & outside).value / put_in)
-        powers.append(powers[-1] + _mean(left, inside & outside).value / put_in)
-        difference = _mean(residual, inside & outside, minus=(response, left))
-        total = 1 - powers[-1]
-        bands.append(
-            Band(
-                low,
-                high,
-                tuple(before - after for before, after in itertools.pairwise(powers)),
-                total,
-                Finding(total - difference.value / put_in, difference.uncertainty / put_in),
-            )
+        after, kept, rest = (
+            _mean(modes, used).value / put_in for modes, used in ((response, inside), (response, both), (left, both))
         )
+        earlier = (_mean(modes, inside).value / put_in for modes in followed)
+        powers = [1.0, *earlier, after * scale**2, after, kept, kept + rest]
+        losses, total = tuple(one - other for one, other in itertools.pairwise(powers)), 1 - powers[-1]
+        difference = _mean(residual, both, minus=(response, left))
+        measured = Finding(total - difference.value / put_in, difference.uncertainty / put_in)
+        bands.append(Band(low, high, losses, total, measured))
     return bands
 
 

@@ -103,11 +103,9 @@ class Noise(Step):
     }
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the spectra of the noise alone, and its level."""
         return _alone(graph, "noise")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare the spectra of the noise with P_N."""
         run = only(runs)
         found = run.delay_spectra("noise")
         theory = noise_power(run.experiment.instrument, run.experiment.power, run.levels)
@@ -141,7 +139,6 @@ def noise_power(instrument: InstrumentSettings, power: PowerSettings, levels: Le
 
 
 def _mean(values: np.ndarray) -> Finding:
-    """Return the mean of independent samples and its standard error."""
     return Finding(float(values.mean()), float(values.std(ddof=1) / np.sqrt(values.size)))
 
 
@@ -201,11 +198,9 @@ class FlatSignal(Step):
     redundant: str = Field(description="The experiment whose baselines are crossed with others of their group.")
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the spectra of the EoR alone, and its level."""
         return _alone(graph, "eor")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare the modes of all experiments with the input."""
         normalizations, independent = [], []
         for name, run in runs.items():
             if name == self.redundant:
@@ -233,7 +228,6 @@ class FlatSignal(Step):
 
 
 def _exponential(sample: np.ndarray) -> float:
-    """Return the p-value of powers against an exponential distribution, NaN if one is not finite."""
     if not np.isfinite(sample).all():
         return np.nan
     known, rng = {"loc": 0.0}, np.random.default_rng(1)
@@ -309,11 +303,9 @@ class SteepSignal(Step):
     k_min: Wavenumber = Field(description="Modes below are left out.")
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the spectra of the EoR alone, and its level."""
         return _alone(graph, "eor")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare the modes of all experiments with the windowed input."""
         whole: list[Finding] = []
         bands: dict[tuple[float, float], list[Finding]] = {band: [] for band in itertools.pairwise(BANDS)}
         for run in runs.values():

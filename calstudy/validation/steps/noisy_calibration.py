@@ -32,7 +32,7 @@ from calstudy.calibrate.agreement import ALLOWED, PARTS, pooled
 from calstudy.calibrate.execution import run_calibrator
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.records import CalibrationResult
-from calstudy.claims.bins import reflection_bins
+from calstudy.claims.bins import at_reflections
 from calstudy.experiment.model import Variant
 from calstudy.products import corruption, simulation, spectra
 from calstudy.products.corruption import PARITIES
@@ -87,12 +87,10 @@ class Flags(Step):
     integrations: int = Field(1, ge=1, description="How many are calibrated, the first ones.")
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the foregrounds alone, and with gains and noise in both realizations."""
         data = {parity: corruption.data(graph, VARIANT, parity) for parity in PARITIES}
         return {"foregrounds": required(simulation.foregrounds(graph), "foregrounds"), **data}
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Calibrate both realizations with all patterns of flags."""
         run = only(runs)
         settings = run.experiment.calibration
         data = {parity: self._read(run.products[parity] / DATA) for parity in PARITIES}
@@ -139,13 +137,12 @@ def _influence(data: UVData, flags: np.ndarray, result: CalibrationResult, setti
     changes = []
     for value in (HUGE * (1 + 2j), complex(np.nan, np.nan)):
         other = run_calibrator(settings, flagged(data, flags, value), sky)
-        for mine, its in (
-            (result.gains.gain_array, other.gains.gain_array),
-            (result.model.data_array, other.model.data_array),
-            (result.residual.data_array, other.residual.data_array),
-        ):
-            changes.append(np.abs(mine - its).max())
+        changes += [np.abs(mine - its).max() for mine, its in zip(_arrays(result), _arrays(other), strict=True)]
     return largest(changes)
+
+
+def _arrays(result: CalibrationResult) -> tuple[np.ndarray, ...]:
+    return result.gains.gain_array, result.model.data_array, result.residual.data_array
 
 
 def bias(even: UVData, odd: UVData) -> Finding:
@@ -187,11 +184,9 @@ class GainErrors(Step):
     }
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the fractions of both noise realizations."""
         return {parity: gain_coverage(graph, VARIANT, parity) for parity in PARITIES}
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Pool the realizations."""
         run = only(runs)
         found = pooled([read_coverage(run.products[parity]) for parity in PARITIES])
         values = {
@@ -243,20 +238,12 @@ class LowSnr(Step):
     }
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the averaged spectra of all variants."""
         return {"spectra": spectra.spectra(graph)}
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare the spectra before and after calibration."""
         run = only(runs)
-        corrupted, residual = (run.spherical(name, "outside-wedge") for name in ("uncalibrated", "residual"))
         # Bins without a number in the residual are not left out.
-        chosen = reflection_bins(run, run.experiment, corrupted)
-        weights = residual.noise_error[chosen] ** -2.0
-        artefact, left = (
-            float(np.sum(weights * spectrum.power.real[chosen]) / weights.sum()) for spectrum in (corrupted, residual)
-        )
-        sigma = float(weights.sum() ** -0.5)
+        artefact, left, sigma = at_reflections(run, run.experiment, "uncalibrated")
         allowed = NOISE_SIGMAS * sigma
         values = {
             "left": Finding(abs(left) / allowed, sigma / allowed),

@@ -27,18 +27,17 @@ from pyradiosky import SkyModel
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.visibilities import baseline_vectors, subset_template
+from calstudy.claims.bins import beyond_wedge
 from calstudy.corrupt.levels import rms
 from calstudy.experiment.model import Component, Variant
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import BEAMS, DEFAULT_LAYOUT, LAYOUTS, InstrumentSettings
 from calstudy.instrument.telescope import make_template
-from calstudy.power.delay import horizon_delay
 from calstudy.power.spectra import DelaySpectra
 from calstudy.power.transfer import BANDS
 from calstudy.products import spectra
 from calstudy.products.graph import Graph
 from calstudy.run.task import Task
-from calstudy.simulate.floor import MAIN_LOBES
 from calstudy.simulate.interface import Engine
 from calstudy.simulate.nodes import integration_times
 from calstudy.sky.foregrounds import make_foregrounds
@@ -101,7 +100,6 @@ class Engines(Step):
     times: int = Field(ge=1, description="Integrations, spread over the paper's.")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Run all engines on the same simulation, and on single sources."""
         compared = [item for item in CANDIDATES if item[0] in self.engines]
         errors, closed = self.errors(compared), {item: closed_form_error(*item) for item in compared}
         both = {**errors, **{key: largest((errors.get(key, 0.0), value)) for key, value in closed.items()}}
@@ -182,10 +180,6 @@ def _closed_form(template: UVData, zenith_angle: float, azimuth: float) -> np.nd
     return power * FLUX / 2 * np.exp(2j * np.pi * turns)
 
 
-MAIN_LOBE = MAIN_LOBES["blackman-harris"]
-"""Half width of the main lobe of the estimator's widest taper, in units of 1 / bandwidth."""
-
-
 class Foregrounds(Step):
     """P^{F+S} / P^S - 1 over all modes outside the wedge, the floor P^F / P^S, and the excess over it."""
 
@@ -211,7 +205,6 @@ class Foregrounds(Step):
     }
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the spectra of EoR and foregrounds, each alone and both together, without gains."""
         components: dict[str, tuple[Component, ...]] = {
             "eor": ("eor",),
             "foregrounds": ("foregrounds",),
@@ -223,10 +216,9 @@ class Foregrounds(Step):
         }
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare the three spectra outside the wedge, for all modes together and in bands."""
         run = only(runs)
         signal, floor, both = (run.delay_spectra(product) for product in ("eor", "foregrounds", "both"))
-        outside = beyond_wedge(signal, run.experiment.power.wedge_buffer)
+        outside = beyond_wedge(signal.delay, signal.length, run.experiment.power.wedge_buffer)
         k = np.hypot(signal.k_perp[:, None], signal.k_parallel)
         excess = _over_signal(both.power.real - signal.power.real, signal, outside)
         beyond = both.power.real - signal.power.real - floor.power.real
@@ -245,13 +237,6 @@ class Foregrounds(Step):
             "floor": _over_signal(floor.power.real, signal, outside),
         }
         return Findings(values, tuple(remarks))
-
-
-def beyond_wedge(signal: DelaySpectra, buffer: float) -> np.ndarray:
-    """Return which modes, (Nu, Nd), are beyond horizon and buffer (s), or the taper's main lobe if it is wider."""
-    lobe = MAIN_LOBE * (signal.delay[1] - signal.delay[0])
-    horizon = horizon_delay(signal.length)
-    return np.abs(signal.delay) > horizon[:, None] + max(buffer, lobe)
 
 
 def _over_signal(power: np.ndarray, signal: DelaySpectra, used: np.ndarray) -> Finding:

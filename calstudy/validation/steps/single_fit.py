@@ -29,7 +29,7 @@ Differences are rms over the rms of the data.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -77,37 +77,26 @@ class SingleIntegration:
     true_gains: np.ndarray
 
     @classmethod
-    def of(cls, run: StepInput) -> SingleIntegration:
-        """Return the first integration of an experiment, from its products "foregrounds", "gains" and "levels"."""
-        foregrounds = first_integrations(read_visibilities(run.products["foregrounds"] / VISIBILITIES))
-        settings, frame = run.experiment.calibration, Observation(foregrounds)
+    def of(cls, run: StepInput, antennas: int | None, channels: int | None) -> SingleIntegration:
+        """Return the first integration of the products "foregrounds", "gains" and "levels" of an experiment.
+
+        Of antennas and channels it has the first ones, or all if None.
+        """
+        settings = run.experiment.calibration
         if not isinstance(settings, ForegroundFit):
             raise InputError(f"{settings.label}: the measurement needs a calibrator with foregrounds, such as calamity")
-        gains = read_gains(run.products["gains"])
+        whole = first_integrations(read_visibilities(run.products["foregrounds"] / VISIBILITIES))
+        numbers, used = Observation(whole).numbers[:antennas], np.arange(whole.Nfreqs)[:channels]
+        foregrounds = whole.select(antenna_nums=numbers, freq_chans=used, inplace=False, run_check=False)
+        frame = Observation(foregrounds)
         return cls(
             foregrounds=foregrounds,
             structure=make_structure(frame, settings),
             numbers=frame.numbers,
             settings=settings,
             noise_std=run.levels.noise_std,
-            true_gains=gains.at(0, frame.numbers),
+            true_gains=read_gains(run.products["gains"]).at(0, frame.numbers)[:, used],
         )
-
-    def first(self, antennas: int | None, channels: int | None) -> SingleIntegration:
-        """Return the first antennas and channels only; all if None."""
-        if antennas is None and channels is None:
-            return self
-        numbers = self.numbers[:antennas]
-        cut = self.foregrounds.select(
-            antenna_nums=numbers,
-            freq_chans=np.arange(self.foregrounds.Nfreqs)[:channels],
-            inplace=False,
-            run_check=False,
-        )
-        frame = Observation(cut)
-        structure = make_structure(frame, self.settings)
-        gains = self.true_gains[np.searchsorted(self.numbers, frame.numbers), : structure.n_frequencies]
-        return replace(self, foregrounds=cut, structure=structure, numbers=frame.numbers, true_gains=gains)
 
     @property
     def modelled(self) -> np.ndarray:
@@ -144,10 +133,9 @@ class SingleIntegration:
         start: np.ndarray | None = None,
         sky_model: bool = True,
     ) -> CalibrationResult:
-        """Calibrate visibilities, (Nbls, Nfreqs), Jy, with the foregrounds as sky model, which fixes the scale.
+        """Calibrate visibilities, (Nbls, Nfreqs), Jy, from gains (Nants, Nfreqs) or as the settings say.
 
-        `settings` are by default those of the experiment. The fit starts from the complex gains `start`, (Nants,
-        Nfreqs), or according to the settings.
+        The foregrounds are the sky model, which fixes the scale.
         """
         gains = None if start is None else self.uvcal(start)
         sky = self.foregrounds if sky_model else None
@@ -169,7 +157,6 @@ class SingleIntegrationStep(Step):
     channels: int | None = Field(None, ge=1, description="How many are used, the first ones; null: all.")
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the tasks of foregrounds, gains and levels."""
         return {
             "foregrounds": required(simulation.foregrounds(graph), "foregrounds"),
             "gains": corruption.gains(graph),
@@ -177,8 +164,7 @@ class SingleIntegrationStep(Step):
         }
 
     def integration(self, runs: Mapping[str, StepInput]) -> SingleIntegration:
-        """Return the first integration of the experiment, with the first antennas and channels."""
-        return SingleIntegration.of(only(runs)).first(self.antennas, self.channels)
+        return SingleIntegration.of(only(runs), self.antennas, self.channels)
 
 
 PATIENT = {"precision": "double", "tolerance": 1e-14, "max_steps": 300}
@@ -205,7 +191,6 @@ class Noiseless(SingleIntegrationStep):
     }
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Calibrate in both precisions."""
         integration = self.integration(runs)
         exact = integration.products(integration.true_gains) * integration.modelled
         patient = integration.settings.solver.model_copy(update=PATIENT)
@@ -256,7 +241,6 @@ class Degeneracies(SingleIntegrationStep):
     draws: int = Field(20, ge=1, description="Random exchanges of each kind.")
 
     def measure(self, runs: Mapping[str, StepInput], output: Path) -> Findings:
-        """Compare exchanges at the true gains, and fits that start from exchanged gains."""
         integration, rng = self.integration(runs), np.random.default_rng(20220422)
         gains = integration.true_gains
         noise = integration.noise_std * (rng.standard_normal((2, *integration.modelled.shape)) / np.sqrt(2))
@@ -304,10 +288,7 @@ def narrow_model(integration: SingleIntegration) -> np.ndarray:
 
 
 def best_misfit(integration: SingleIntegration, visibilities: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return V - g_a g_b* F with the best-fitting F of the basis, (Nbls, Nfreqs), for gains (Nants, Nfreqs).
-
-    It is solved by linear least squares for each baseline, independently of the solvers.
-    """
+    """Return V - g_a g_b* F, (Nbls, Nfreqs), with F by linear least squares on the basis for each baseline."""
     products = integration.products(gains)
     misfit = np.empty_like(visibilities)
     for bucket in integration.structure.basis.buckets:
