@@ -15,7 +15,6 @@ from calstudy.base.visibilities import keep_compiled_pyuvdata
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
-    from pyuvdata.uvdata import FastUVH5Meta
 
 VISIBILITIES, DATA, GAINS, AVERAGE = "visibilities.uvh5", "data.uvh5", "gains.calh5", "average.uvh5"
 MODEL, RESIDUAL, SOLUTION = "model.uvh5", "residual.uvh5", "solution.json"
@@ -54,15 +53,11 @@ def read_visibilities(path: Path, times: np.ndarray | None = None) -> UVData:
     return UVData.from_file(path, file_type="uvh5", run_check=False, times=times)
 
 
-def _header(path: Path) -> FastUVH5Meta:
-    from pyuvdata.uvdata import FastUVH5Meta
-
-    return FastUVH5Meta(path)
-
-
 def integration_times(path: Path) -> np.ndarray:
     """Return the times (JD) of the integrations of a UVH5 product, ascending."""
-    return np.unique(_header(path).time_array)
+    from pyuvdata.uvdata import FastUVH5Meta
+
+    return np.unique(FastUVH5Meta(path).time_array)
 
 
 def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, list[UVData]]]:
@@ -71,7 +66,9 @@ def read_in_parts(paths: Sequence[Path], samples: int) -> Iterator[tuple[range, 
     A piece has at most `samples` visibilities of each file, but at least one integration. Yield the indices of its
     integrations in the run, and the data of each file.
     """
-    header, times = _header(paths[0]), integration_times(paths[0])
+    from pyuvdata.uvdata import FastUVH5Meta
+
+    header, times = FastUVH5Meta(paths[0]), integration_times(paths[0])
     step = max(1, samples // (header.Nbls * header.Nfreqs * header.Npols))
     for first in range(0, times.size, step):
         part = range(first, min(first + step, times.size))

@@ -100,14 +100,13 @@ def _flux_scale(graph: Graph) -> Task:
     """
     residual = graph.experiment.variants[SIGNAL_LOSS_VARIANTS[0]]
     even, odd = (calibration.calibration(graph, residual, parity) for parity in PARITIES)
-    gains = corruption.gains(graph) if residual.effects else None
     return FluxScale(
         "flux scale",
         taper=graph.experiment.power.taper,
         polarizations=len(graph.experiment.instrument.polarizations),
         even=even,
         odd=odd,
-        gains=gains,
+        gains=corruption.gains(graph) if residual.effects else None,
     )
 
 
