@@ -319,7 +319,7 @@ MUTATIONS = (
         KEYS,
     ),
     Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, warn):", "if True:", STORE),
-    Mutation("verify reads no file", 'sha256(product.path / name) == entry["sha256"]', "True", STORE),
+    Mutation("verify reads no file", 'sha256(self.folder(stage, key) / name) == entry["sha256"]', "True", STORE),
     Mutation("a kept product is dropped", ' and product.record.get("temporary")', "", STORE),
     Mutation(
         "what other runs need is dropped",
