@@ -18,6 +18,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, wraps
+from html import escape
 from io import StringIO
 from numbers import Integral
 from pathlib import Path, PurePath
@@ -95,9 +96,16 @@ def _typed(function: Callable[P, R]) -> Callable[P, R]:
 def load(source: str | Path | Mapping[str, Any], /, scale: str | None = None, **changes: Any) -> LoadedStudy:
     """Load a study; raises InputError if the file cannot be read, or a field is unknown or has a wrong value.
 
-    The source is a YAML file, the name of a published experiment, or the content of a file, whose relative paths start
-    at the working directory. The scale is one of the file's `scales`. Fields are changed by dotted path, to values that
-    the file could have: ``**{"instrument.times.count": 8}``.
+    Parameters
+    ----------
+    source
+        A YAML file, the name of a published experiment, such as "quickstart", or the content of a file, whose relative
+        paths start at the working directory.
+    scale
+        Name of a set of overrides in the file's `scales`.
+    **changes
+        Fields that are changed, by dotted path: ``**{"instrument.times.count": 8}``. Values are those that the file
+        could have: numbers, texts with units, lists and mappings.
     """
     texts = _overrides(changes)
     if isinstance(source, Mapping):
@@ -123,11 +131,26 @@ def calibrate_data(
 ) -> CalibratedData:
     """Calibrate measured data, as the command ``calstudy calibrate`` does; an interrupted calibration is resumed.
 
-    Data are files in any format that pyuvdata reads. `observed` has fields of that section of a study of measured data:
-    `select`, `sky_model`, `flag_interference`. A number as `gain_errors` is that of ``--gain-error-realizations``, for
-    calibrators whose gains have no errors of their own. All other arguments are fields of the section `calibration` by
-    dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``. Raises InputError if the data cannot be
-    used, a field is unknown or has a value that is not allowed, or the folder has results.
+    Raises InputError if the data cannot be used, a field is unknown or has a value that is not allowed, or the folder
+    has results.
+
+    Parameters
+    ----------
+    data
+        Files in any format that pyuvdata reads.
+    output
+        Folder for the results.
+    observed
+        Fields of the section `observed` of a study of measured data: `select`, `sky_model`, `flag_interference`.
+    overwrite
+        Whether results of an earlier calibration may be replaced.
+    quiet
+        If true, no progress is printed.
+    gain_errors
+        Whether gains get their errors by noise, as without ``--no-gain-errors``. A number is that of
+        ``--gain-error-realizations``, for calibrators whose gains have no errors of their own.
+    **changes
+        Fields of the section `calibration` by dotted path: ``calibrator="sky-based"``, ``**{"basis.buffer": "50 ns"}``.
     """
     paths = [data] if isinstance(data, str | Path) else data
     section = {"data": [str(path) for path in paths], **(observed or {})}
@@ -290,6 +313,9 @@ class ByVariant(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._names)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return self._names
 
     def __repr__(self) -> str:
         return f"variants: {', '.join(self._names)}"
@@ -464,6 +490,9 @@ class OpenRun:
         lines = [f"run {self.name!r}, finished {finished}, in {self.folder}", f"figures: {', '.join(self.figures)}"]
         setup = [self._folder.manifest["setup"]] if "setup" in self._folder.manifest else []
         return "\n".join([*lines, *setup, *([numbers] if numbers else [])])
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
 
     @cached_property
     def _study(self) -> Study:

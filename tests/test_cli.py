@@ -146,6 +146,7 @@ def test_all_faults_of_a_file_are_told_on_standard_error(here, capsys):
             ["plan", "tiny.yaml", "--set", "calibration.basis.buffer=10 us"],
             "calibration.basis: a delay half-width",
         ),
+        (["examples"], "'examples' was a command of earlier versions; use calstudy init --list"),
         (["data", "fetch", "gleem"], "nothing that can be fetched (allowed: gleam, beam, g4jy, haslam)"),
     ],
 )

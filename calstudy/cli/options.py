@@ -82,8 +82,23 @@ def named_as_options(*names: tuple[str, str]) -> Iterator[None]:
         raise type(error)(renamed(str(error))) from None
 
 
+REMOVED = {
+    "examples": "calstudy init --list",
+    "schema": "calstudy fields --schema FILE",
+    "check": "calstudy run checks, whose figures are the checks",
+    "bench": "the benchmarks of the repository (benchmarks/README.md)",
+}
+"""Commands of earlier versions, and what has taken their place."""
+
+
 class Sections(TyperGroup):
-    """A group of commands whose help lists them by section."""
+    """A group of commands whose help lists them by section, and which knows those of earlier versions."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command by its name; one of an earlier version ends with a sentence that names its successor."""
+        if args and args[0] in REMOVED:
+            ctx.fail(f"'{args[0]}' was a command of earlier versions; use {REMOVED[args[0]]}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands by section, each with its first sentence in as many lines as it has."""
