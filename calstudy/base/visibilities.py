@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from calstudy.base.errors import InputError
 
 if TYPE_CHECKING:
     from pyuvdata import Telescope, UVData
+    from pyuvdata.uvbase import UVBase
+
+Item = TypeVar("Item", bound="UVBase")
 
 
 @cache
@@ -37,6 +40,22 @@ def keep_compiled_pyuvdata() -> None:
             numbers = antnums_to_baseline(np.zeros(1, int), np.ones(1, int), Nants_telescope=2)
             baseline_to_antnums(numbers, Nants_telescope=2)
             return
+
+
+def taken(item: Item, axis: str, chosen: np.ndarray) -> Item:
+    """Return a copy of an object of pyuvdata or pyradiosky with entries along an axis, such as "Nblts", in this order.
+
+    Their `select` leaves the order as it is.
+    """
+    found = item.copy()
+    for name in found:
+        parameter = getattr(found, name)
+        if isinstance(parameter.form, tuple) and axis in parameter.form and parameter.value is not None:
+            values = np.asarray(parameter.value) if isinstance(parameter.value, list) else parameter.value
+            # It is the first axis or the last; coordinates of sources have no other.
+            setattr(found, parameter.name, values[chosen] if parameter.form[0] == axis else values[..., chosen])
+    setattr(found, axis, len(chosen))
+    return found
 
 
 def require_rectangular(uvd: UVData) -> None:

@@ -21,7 +21,7 @@ from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError, errors_of_files
 from calstudy.base.foreign_files import reason_of, require_self_contained
 from calstudy.base.gain_files import CASACORE
-from calstudy.base.visibilities import keep_compiled_pyuvdata, polarization_names, positions
+from calstudy.base.visibilities import keep_compiled_pyuvdata, polarization_names, positions, taken
 from calstudy.calibrate.records import PARALLEL_HANDS
 from calstudy.instrument.array_layouts.csv import read_positions
 from calstudy.instrument.layouts import require_valid
@@ -307,8 +307,7 @@ OF_BASELINE = ("ant_1_array", "ant_2_array", "baseline_array", "uvw_array", "int
 
 def _reindexed(data: UVData, by_time: np.ndarray, by_baseline: np.ndarray) -> UVData:
     """Return data whose sample i is sample by_baseline[i], with the properties of the time from sample by_time[i]."""
-    result = data.copy()
-    result._select_along_param_axis({"Nblts": by_time})
+    result = taken(data, "Nblts", by_time)
     for name in OF_BASELINE:
         setattr(result, name, getattr(data, name)[by_baseline])
     result.Ntimes = np.unique(result.time_array).size

@@ -21,6 +21,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.package_files import G4JY, HASLAM
 from calstudy.base.user_code import load_function, user_code
+from calstudy.base.visibilities import taken
 from calstudy.sky import settings as section
 from calstudy.sky.catalogue import (
     GLEAM_SOURCES,
@@ -306,7 +307,7 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
         _require_channels(sky, frequencies, f"sky.foregrounds.path: {settings.path}", "; use spectrum: flat")
     chosen = brightest(flux, settings)
     stand_in = f"foregrounds: {len(chosen)} sources of {settings.path.name}"
-    return Foregrounds(_in_order(sky, chosen), stand_in)
+    return Foregrounds(taken(sky, "Ncomponents", chosen), stand_in)
 
 
 def _require_in_band(sky: SkyModel, frequencies: np.ndarray, path: Path) -> None:
@@ -340,14 +341,7 @@ def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregr
     flux = _at_frequency(sky, float(np.mean(frequencies))).stokes[0, 0].to_value("Jy")
     order = np.argsort(-flux, kind="stable")
     stand_in = f"foregrounds: {sky.Ncomponents} sources by {where}"
-    return Foregrounds(_in_order(sky, order), stand_in)
-
-
-def _in_order(sky: SkyModel, chosen: np.ndarray) -> SkyModel:
-    """Return sources of a catalogue in a given order; `SkyModel.select` of all sources leaves the order as it is."""
-    found = sky.copy()
-    found._select_along_param_axis({"Ncomponents": chosen})
-    return found
+    return Foregrounds(taken(sky, "Ncomponents", order), stand_in)
 
 
 def _at_frequency(sky: SkyModel, frequency: float) -> SkyModel:

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.resources import Cost
-from calstudy.base.visibilities import antenna_indices, require_rectangular, use_bundled_earth_orientation
+from calstudy.base.visibilities import antenna_indices, require_rectangular, taken, use_bundled_earth_orientation
 from calstudy.instrument.interface import AntennaBeam, AntennaBeams
 from calstudy.simulate.interface import Engine, SimulationSize, polarization_feeds, refusal_of_polarization
 from calstudy.simulate.nodes import integration_times
@@ -247,7 +247,7 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
     by_antenna = dict(zip(template.telescope.antenna_names, index.tolist(), strict=True))
     # In the order of their numbers, as pyuvsim looks antennas up.
     template = template.copy()
-    template.telescope._select_along_param_axis({"Nants": np.argsort(template.telescope.antenna_numbers)})
+    template.telescope = taken(template.telescope, "Nants", np.argsort(template.telescope.antenna_numbers))
     listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
     tasks = range(template.Nblts * template.Nfreqs)
     cube = np.empty((template.Nblts, template.Nfreqs, len(_products(beams[0]))), dtype=np.complex128)
