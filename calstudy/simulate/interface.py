@@ -112,7 +112,7 @@ def polarization_feeds(template: UVData) -> list[str]:
 def refusal_of_polarization(sky: SkyModel, template: UVData) -> str | None:
     """Return the reason why an engine of Stokes I in xx and yy does not support a simulation, or None if it does."""
     if np.any(sky.stokes[1:].value):
-        return "the sky is polarized, an unpolarized one is needed"
+        return "does not handle a polarized sky"
     try:
         polarization_feeds(template)
     except InputError as error:

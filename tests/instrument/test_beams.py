@@ -496,7 +496,7 @@ def test_a_beam_of_a_file_is_fitted_and_integrated_once(tmp_path, embedded):
         angles.append(make_beam(FileBeam(kind="beamfits", path=path)).solid_angles(frequencies, "xx"))
     assert _solid_angles.cache_info().misses == before
     # Channels together, or one by one.
-    table = make_beam(FileBeam(kind="beamfits", path=path))._table
+    table = make_beam(FileBeam(kind="beamfits", path=path)).table
     for place in (0, 17, 39):
         power = (np.abs(table.jones(frequencies[place : place + 1])[:, 0, 0]) ** 2).sum(axis=0)
         single = integrate_power(power, table.zenith_angles)
