@@ -319,8 +319,8 @@ def test_a_world_that_changes_nothing_is_refused_and_notes_of_cases_are_shown(tm
     Path("file.yaml").write_text(yaml.safe_dump(data))
     assert "mine in a: calibration.assumed.sky.foregrounds.flux_limit" in refused(capsys)
     limits = "worlds={ideal: {}, a: {calibration.assumed.sky.foregrounds.flux_limit: 20 Jy}}"
-    told = planned(capsys, "--set", limits, "--set", "simulation.chunks=50")
-    assert told.count("simulation.chunks = 50") == 1
+    told = planned(capsys, "--set", limits, *SHORTER)
+    assert told.count("power.coherent_time = 1 s") == 1
 
 
 @pytest.mark.parametrize(
