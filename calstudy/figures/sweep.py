@@ -94,9 +94,8 @@ def _add_legend(figure: style.Figure, axes: style.Axes, edges: np.ndarray, colum
     labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
     labels.append("free of the flux scale $s$")
     scale_free = style.entry(color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6)
-    figure.legend(
-        [*axes.containers, scale_free], labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2
-    )
+    handles: list[Any] = [*axes.containers, scale_free]
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
 
 
 class Sweep(StudyFigure):
