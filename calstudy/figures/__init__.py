@@ -18,7 +18,7 @@ import numpy as np
 from calstudy.base.errors import ExperimentError, InputError, nearest
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.calibrate.settings import GainFit
-from calstudy.experiment.model import FIGURES, Experiment
+from calstudy.experiment.model import FIGURES, SIGNAL_LOSS_VARIANTS, Experiment
 from calstudy.plotting.style import figure_arrays, journal_style, note_stand_ins, save_figure
 from calstudy.products import calibration, corruption
 from calstudy.products.comparison import Case, read_cases
@@ -37,17 +37,7 @@ TWO_ARRAYS = {"minimally_redundant": "Minimally redundant", "redundant": "Redund
 
 
 class Drawing(NamedTuple):
-    """A drawn figure.
-
-    Attributes
-    ----------
-    figure
-        From matplotlib.
-    shown
-        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.style.figure_arrays`).
-    notes
-        JSON-able, kept in the record of the product.
-    """
+    """A drawn figure, the arrays that it shows (see `calstudy.plotting.style.figure_arrays`), and JSON-able notes."""
 
     figure: Figure
     shown: Any
@@ -61,32 +51,23 @@ class StudyFigure(Plugin):
     ----------
     of
         Kinds of study that the figure can be drawn of, the names of modules of `calstudy.studies.kinds`.
-    caption
-        One sentence for the report.
     titles
         Of a figure that compares members of a collection: their roles, from left to right, and headings. Empty: all
         members, by their names.
-    variants
-        Names of the variants of the data that it requires.
-    needs_calibration
-        True if `residual` must be calibrated data with foregrounds and effects.
-    needs_signal_loss
-        True if the experiment must calibrate data with the EoR and without.
-    needs_least_squares
-        True if the calibrator must fit by least squares: it is repeated, or its tangent space is needed.
-    needs_foregrounds
-        True if the sky must have foregrounds.
+    variants, needs_calibration, needs_signal_loss, needs_least_squares, needs_foregrounds
+        What the experiment must have: variants of the data; `residual` of calibrated data with foregrounds and effects;
+        data calibrated with the EoR and without; a calibrator that fits by least squares; foregrounds.
     sections
         Sections and fields (dotted path) of the experiment that it reads; see `settings`.
-    needs_products
-        False if the settings are sufficient: nothing is read from products.
+    products
+        What it shows of a run, or of each member of a family: names of its own, and functions of the graph that return
+        a task. Empty: the settings are sufficient. See `inputs`.
     needs_injection
         True if a signal must be injected into measured data.
     shows_sky
         True if a stand-in for sky, beam or scale enters it, and so is printed on it.
     tolerances
-        Allowed differences of its arrays from a reference: pairs of a pattern of array names and a tolerance, of which
-        the first that matches counts (`calstudy.verdicts.tolerances`).
+        Patterns of names of its arrays with their tolerance; the first that matches counts.
     """
 
     registry: ClassVar = FIGURES
@@ -99,7 +80,7 @@ class StudyFigure(Plugin):
     needs_least_squares: ClassVar[bool] = False
     needs_foregrounds: ClassVar[bool] = False
     sections: ClassVar[tuple[str, ...]] = ()
-    needs_products: ClassVar[bool] = True
+    products: ClassVar[Mapping[str, Callable[[Any], Task | None]]] = {"spectra": spectra}
     needs_injection: ClassVar[bool] = False
     shows_sky: ClassVar[bool] = True
     tolerances: ClassVar[Rules] = ()
@@ -110,7 +91,8 @@ class StudyFigure(Plugin):
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
         if "experiment" not in self.of:
             return f"is a figure {_listed(self.of)}, and cannot be drawn of a single experiment"
-        missing = [name for name in self.variants if name not in experiment.variants]
+        wanted = self.variants or (SIGNAL_LOSS_VARIANTS if self.needs_signal_loss else ())
+        missing = [name for name in wanted if name not in experiment.variants]
         if missing:
             return f"needs the variant(s) {', '.join(missing)}"
         if self.needs_foregrounds and not experiment.sky.has_foregrounds:
@@ -138,18 +120,12 @@ class StudyFigure(Plugin):
         return tuple(self.titles)
 
     def inputs(self, graph: Any) -> Mapping[str, Task]:
-        """Return the products of a run, or of one member of a family, that the figure shows; by default its spectra.
+        """Return the tasks of `products`, by names of the figure's own, of a run or of one member of a family.
 
-        Parameters
-        ----------
-        graph
-            Products of the experiment, a `calstudy.products.graph.Graph`; of measured data a `MeasuredGraph`.
-
-        Returns
-        -------
-        Tasks by names of the figure's own. If it shows a single product of each member, the name may be empty.
+        The graph is a `calstudy.products.graph.Graph`, of measured data a `MeasuredGraph`. If the figure shows a single
+        product of each member, its name may be empty.
         """
-        return {"spectra": spectra(graph)} if self.needs_products else {}
+        return {name: required(product(graph)) for name, product in self.products.items()}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
         """Collect further inputs from a run, or one member: by default the `sections`, by their names."""
@@ -159,13 +135,10 @@ class StudyFigure(Plugin):
     def draw(self, job: Job) -> Drawing:
         """Draw the figure.
 
-        Parameters
-        ----------
-        job
-            Its `inputs` are folders of products, by the names of the method `inputs`; those of members of a family
-            have names ``name:label`` (`members_of`). Its `settings` are those of the method `settings`, and
-            ``notes``: the stand-ins, which are printed below the figure. Of a family, ``layouts`` has the array
-            layout of each member, by label, and ``members`` the settings of each if there are any.
+        `job.inputs` are folders of products, by the names of the method `inputs`; those of members of a family have
+        names ``name:label`` (`members_of`). `job.settings` are those of the method `settings`, and ``notes``, the
+        stand-ins. Of a family, ``layouts`` has the array layout of each member, by label, and ``members`` the settings
+        of each if there are any.
         """
 
 
@@ -173,12 +146,14 @@ class InspectedFigure(StudyFigure):
     """A figure of two antennas in one integration, those of `outputs.inspect`: of their gains, or of their baseline."""
 
     sections = ("instrument.layout", "outputs.inspect.antennas", "outputs.inspect.integration")
+    shown: ClassVar[Mapping[str, str]] = {}
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the true gains and the calibration of `residual`."""
-        experiment = graph.experiment
-        fitted = calibration.calibration(graph, experiment.variants["residual"], experiment.outputs.inspect.realization)
-        return {"gains": corruption.gains(graph), "calibration": fitted}
+        """Return the true gains, the calibration of `residual`, and the data of the variants `shown`."""
+        variants, realization = graph.experiment.variants, graph.experiment.outputs.inspect.realization
+        fitted = calibration.calibration(graph, variants["residual"], realization)
+        data = {name: corruption.data(graph, variants[found], realization) for name, found in self.shown.items()}
+        return {"gains": corruption.gains(graph), "calibration": fitted, **data}
 
 
 CONVERGED, MOST = "converged", 0.5
@@ -204,16 +179,13 @@ def _of_solutions(error: Callable[[Arrays, str], np.ndarray]) -> Callable[[Array
 
 
 class CasesFigure(StudyFigure):
-    """A figure of the scores of a comparison: calibrators in worlds.
+    """A figure of the scores of a comparison, calibrators in worlds: those in ``bands`` of k, or in its ``bins``.
 
-    Attributes
-    ----------
-    scores
-        The scores that it shows, and saves as its arrays: those in ``bands`` of k, or in the experiment's ``bins``.
-        The fraction of solves that converged is saved beside them.
+    The fraction of solves that converged is saved beside them.
     """
 
     of = ("comparison",)
+    products: ClassVar = {"": score}
     scores: ClassVar[Literal["bands", "bins"]] = "bands"
     tolerances = (
         (r".*\.flux_scale", Drawn(_of_solutions(spread_of_scale), "the flux scale of other noise")),
@@ -223,20 +195,11 @@ class CasesFigure(StudyFigure):
         (r".*\.(transfer|bias|recovered)", Drawn(_of_solutions(BY_OWN_ERROR.error), BY_OWN_ERROR.why)),
     )
 
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the scores of one case."""
-        return {"": required(score(graph))}
-
     @abstractmethod
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
-        """Draw the figure.
+        """Draw cases, by the labels of world and calibrator in the order of the file, without refused ones.
 
-        Parameters
-        ----------
-        cases
-            By the labels of world and calibrator, in the order of the file; without those that a calibrator refuses.
-        job
-            Its `settings` have ``calibrators`` and ``worlds``, their labels.
+        `job.settings` has the labels, ``calibrators`` and ``worlds``.
         """
 
     def draw(self, job: Job) -> Drawing:
@@ -316,18 +279,14 @@ def figure_task(
     with guarded(figure):
         own = {label: figure.settings(graph) for label, graph in members.items()} if settings is None else {}
         inputs = {
-            ":".join(part for part in (name, label) if part): task
+            ":".join(filter(None, (name, label))): task
             for label, graph in members.items()
             for name, task in figure.inputs(graph).items()
         }
-    if settings is None:
-        settings = own[""] if "" in own else _of_members(members, own)
-    return draw_task(figure, inputs, stand_ins, settings)
-
-
-def _of_members(members: Mapping[str, Any], own: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    layouts = {label: graph.experiment.instrument.layout for label, graph in members.items()}
-    return {"layouts": layouts, **({"members": own} if any(own.values()) else {})}
+    if settings is None and "" not in members:
+        layouts = {label: graph.experiment.instrument.layout for label, graph in members.items()}
+        settings = {"layouts": layouts, **({"members": own} if any(own.values()) else {})}
+    return draw_task(figure, inputs, stand_ins, own[""] if settings is None else settings)
 
 
 def draw_task(

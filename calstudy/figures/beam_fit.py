@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, ClassVar, get_args
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from calstudy.run.task import Job
 from calstudy.simulate.nodes import integration_times
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pyuvdata import UVData
 
     from calstudy.instrument.beams import GriddedBeam
@@ -45,9 +44,7 @@ INTERPOLATION_COLOURS = {
 class BeamInterpolation:
     """Differences between Jones components, relative to the zenith, over directions, feeds and components.
 
-    `fit_rms` and `fit_max` are differences of the smooth fit from the table at the `tabulated` frequencies within the
-    band, (Ntab,), Hz. `others` are rms differences of the other interpolations from the fit at `channels`, (Nfreqs,),
-    Hz.
+    The fit is compared with the table at the `tabulated` frequencies, `others` with the fit at the `channels`, Hz.
     """
 
     tabulated: np.ndarray
@@ -71,15 +68,9 @@ def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> Bea
     difference = _difference(beams[SMOOTH], beams["nearest"], tabulated)
     settings = instrument.channels
     channels = (settings.first + settings.width * np.arange(settings.count))[::step]
-    return BeamInterpolation(
-        tabulated=tabulated,
-        fit_rms=_rms(difference),
-        fit_max=np.abs(difference).max(axis=(0, 1, 3, 4)),
-        channels=channels,
-        others={
-            name: _rms(_difference(beam, beams[SMOOTH], channels)) for name, beam in beams.items() if name != SMOOTH
-        },
-    )
+    others = {name: _rms(_difference(beam, beams[SMOOTH], channels)) for name, beam in beams.items() if name != SMOOTH}
+    largest = np.abs(difference).max(axis=(0, 1, 3, 4))
+    return BeamInterpolation(tabulated, _rms(difference), largest, channels, others)
 
 
 def interpolated(beam: Plugin, channels: Channels, interpolation: str) -> GriddedBeam:
@@ -101,19 +92,16 @@ def _rms(difference: np.ndarray) -> np.ndarray:
 
 
 @style.journal_style()
-def draw_interpolations(found: BeamInterpolation) -> Figure:
+def draw_interpolations(found: BeamInterpolation) -> style.Figure:
     """Draw differences of Jones components, relative to the zenith, against frequency."""
     figure = style.new_figure(style.ONE_COLUMN, 2.9)
     axes = figure.subplots()
-    blue = INTERPOLATION_COLOURS["chebyshev"]
-    axes.plot(
-        found.tabulated / 1e6, found.fit_max, "^", color=blue, markerfacecolor="white", label="fit − table, largest"
-    )
-    axes.plot(found.tabulated / 1e6, found.fit_rms, "o", color=blue, label="fit − table, rms")
+    blue, tabulated = INTERPOLATION_COLOURS[SMOOTH], found.tabulated / 1e6
+    axes.plot(tabulated, found.fit_max, "^", color=blue, markerfacecolor="white", label="fit − table, largest")
+    axes.plot(tabulated, found.fit_rms, "o", color=blue, label="fit − table, rms")
     for name, rms in found.others.items():
-        axes.plot(
-            found.channels / 1e6, rms, color=INTERPOLATION_COLOURS[name], linewidth=0.8, label=f"{name} − fit, rms"
-        )
+        label, colour = f"{name} − fit, rms", INTERPOLATION_COLOURS[name]
+        axes.plot(found.channels / 1e6, rms, color=colour, linewidth=0.8, label=label)
     axes.set(yscale="log", xlabel=style.FREQUENCY, ylabel=r"$|\Delta J|\,/\,|J_\mathrm{zenith}|$")
     axes.margins(x=0.01)
     figure.legend(loc="outside upper center", ncols=2)
@@ -126,7 +114,7 @@ class BeamFitFigure(StudyFigure):
     kind: str = "beam-fit"
 
     caption = "Interpolations of the beam in frequency: differences of Jones components over the zenith."
-    needs_products = False
+    products: ClassVar = {}
     sections = ("instrument",)
 
     def refusal(self, experiment: Experiment) -> str | None:
@@ -141,6 +129,7 @@ class BeamFitFigure(StudyFigure):
         return Drawing(draw_interpolations(found), found, {"fit": fit, "rms_to_fit": rms})
 
 
+NO_DELAY = "instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe"
 PAPER_FLOOR = -45.0
 """Artefacts of beam interpolation in the paper, dB of brightness."""
 LINES = {"dolph-chebyshev": "-", "blackman-harris": ":"}
@@ -148,11 +137,10 @@ LINES = {"dolph-chebyshev": "-", "blackman-harris": ":"}
 
 @dataclass(frozen=True)
 class InterpolationFloor:
-    """Delay spectra and floors of foregrounds simulated with one interpolation of the beam.
+    """Delay spectra, and floors by taper, of foregrounds simulated with one interpolation of the beam.
 
-    `spectrum` is the rms over the shortest third of the baselines, relative to its largest value, with the
-    Dolph-Chebyshev taper, at `delay` >= 0, (Ndelays,), s. `horizon` is the longest horizon delay of these baselines, s.
-    `floors` are by taper.
+    `spectrum` is the rms over the shortest third of the baselines, over its largest value, with the Dolph-Chebyshev
+    taper, at `delay` >= 0, s. `horizon` is the longest horizon delay of these baselines, s.
     """
 
     delay: np.ndarray
@@ -164,10 +152,7 @@ class InterpolationFloor:
 def compare_floors(
     instrument: InstrumentSettings, sky: SkySettings, simulation: SimulationSettings
 ) -> dict[str, InterpolationFloor]:
-    """Simulate foregrounds at the middle integration, once with every interpolation of a tabulated beam.
-
-    Every channel is simulated, so that only the beam is interpolated.
-    """
+    """Simulate every channel of the middle integration, once with every interpolation of a tabulated beam."""
     from calstudy.instrument.telescope import make_template
     from calstudy.simulate.chunks import simulate_visibilities
     from calstudy.sky.foregrounds import make_foregrounds
@@ -190,7 +175,7 @@ def _measure(foregrounds: UVData) -> InterpolationFloor:
 
     buffers = floor_buffers(foregrounds)
     if len(buffers) < len(MAIN_LOBES):
-        raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
+        raise InputError(NO_DELAY)
     lengths = np.linalg.norm(baseline_vectors(foregrounds), axis=1)
     short = lengths <= np.quantile(lengths, 1 / 3)
     delays, power = delay_profile(foregrounds, "dolph-chebyshev")
@@ -204,11 +189,8 @@ def _measure(foregrounds: UVData) -> InterpolationFloor:
 
 
 @style.journal_style()
-def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float | None) -> Figure:
-    """Draw delay spectra of short baselines (left) and the floor beyond the horizon against baseline length (right).
-
-    `eor_level` is marked, in amplitude dB, if it is not None.
-    """
+def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float | None) -> style.Figure:
+    """Draw delay spectra of short baselines, and the floor against baseline length; `eor_level` in dB or None."""
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2, sharey=True)
     for name, floor in floors.items():
@@ -221,15 +203,14 @@ def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float
     left.axvline(horizon * 1e9, color=style.BLACK, linestyle="--", linewidth=0.7)
     for axes in (left, right):
         axes.axhline(PAPER_FLOOR, color=style.GREY, linewidth=0.6, linestyle="-.")
-        if eor_level is not None:
-            axes.axhline(eor_level, color=style.BLACK, linewidth=0.6)
     left.set(xlabel=style.DELAY, ylabel="brightness relative to peak (dB)", ylim=(-105, 3))
     left.margins(x=0)
     right.set(xlabel=style.BASELINE_LENGTH)
     for line, label in (("-", "Dolph–Chebyshev"), (":", "Blackman–Harris"), ("-.", "paper's artefacts")):
         right.plot([], [], color=style.GREY, linestyle=line, label=label)
     if eor_level is not None:
-        right.plot([], [], color=style.BLACK, linewidth=0.6, label="EoR asked for")
+        left.axhline(eor_level, color=style.BLACK, linewidth=0.6)
+        right.axhline(eor_level, color=style.BLACK, linewidth=0.6, label="EoR asked for")
     right.legend(loc="upper right")
     left.legend(loc="upper right")
     return figure
@@ -242,7 +223,7 @@ class DelayFloorFigure(StudyFigure):
 
     caption = "Delay floor of the foregrounds for every interpolation of the beam in frequency."
     needs_foregrounds = True
-    needs_products = False
+    products: ClassVar = {}
     sections = ("instrument", "sky", "simulation", "corruption.eor_level")
 
     def refusal(self, experiment: Experiment) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -13,23 +13,15 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.base.schema import Section
 from calstudy.base.units import Fraction
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.comparison import COLOURS, MARKERS
 from calstudy.plotting import style
 from calstudy.power.gain_bias import GainBias, tolerated_sigma
 from calstudy.power.tables import load_spectrum
 from calstudy.products.comparison import case_name, read_cases
 from calstudy.products.gain_bias import GAIN_BIAS, gain_bias
-from calstudy.products.graph import required
 from calstudy.products.score import score
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.standing import LIMIT, SIGMAS, upper_limit
 from calstudy.verdicts.tolerances import Arrays, Drawn
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from calstudy.products.graph import Graph
 
 HEIGHT = 3.6
 LOWEST, HIGHEST = 3e-4, 100.0
@@ -62,15 +54,9 @@ class PublishedTolerance(Section):
 
 @dataclass(frozen=True)
 class Tolerated:
-    """The law of a world, and the rms in it that causes a bias of `LIMIT`, in Nk bands of k.
+    """The law of a world, the measured bias, and the rms, `sigma`, that causes a bias of `LIMIT`, in Nk bands of k.
 
-    Attributes
-    ----------
-    law : what is expected
-    bias, bias_error : as measured, (Nk,)
-    sigma, sigma_error
-        The rms that is tolerated by the measurement, with the scaling of the law, and its standard deviation, (Nk,);
-        the error is NaN where the bias is not significant, and the rms a lower limit.
+    The error of the rms is NaN where the bias is not significant, and the rms a lower limit.
     """
 
     law: GainBias
@@ -97,25 +83,24 @@ def draw_gain_tolerance(
     worlds: Mapping[str, Tolerated],
     eor_level: float | None = None,
     published: Sequence[PublishedTolerance] = (),
-) -> Figure:
+) -> style.Figure:
     """Draw the tolerated rms against the correlation length, a panel for each band of k: points on lines of the law.
 
-    Colours are correlation times, dashed lines an exponential correlation, open symbols errors that antennas have in
-    common in part, arrows lower limits. Dotted lines are published tolerances, named on the right. `eor_level` is that
-    of the EoR in dB, None if not known.
+    Dashed lines are an exponential correlation, open symbols errors that antennas have in common in part, arrows lower
+    limits, dotted lines published tolerances. `eor_level` is in dB, None if not known.
     """
     edges = next(iter(worlds.values())).law.bin_edges
     figure = style.new_figure(style.TWO_COLUMNS, HEIGHT)
     panels = figure.subplots(1, edges.size - 1, squeeze=False, sharex=True, sharey=True)[0]
-    kinds = list(dict.fromkeys(_kind(found.law) for found in worlds.values()))
+    found = list(worlds.values())
+    kinds = list(dict.fromkeys(_kind(one.law) for one in found))
     for band, axes in enumerate(panels):
         for number, kind in enumerate(kinds):
-            members = [found for found in worlds.values() if _kind(found.law) == kind]
-            _draw_kind(axes, members, band, number)
+            _draw_kind(axes, [one for one in found if _kind(one.law) == kind], band, number)
         for line in published:
             axes.axhline(100 * line.rms, color=style.GREY, linewidth=0.7, linestyle=":", zorder=0)
-        _scale(axes, list(worlds.values()))
-        axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
+        _scale(axes, found)
+        axes.set_title(style.band_name(*edges[band : band + 2]))
     _name(published, panels[-1])
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB"
     panels[0].set_ylabel(f"rms (%) for a bias of {LIMIT:g}{level}")
@@ -142,17 +127,17 @@ def _title(kind: Kind) -> str:
 
 def _look(kind: Kind, number: int) -> dict[str, Any]:
     _, form, common = kind
-    colour = COLOURS[number % len(COLOURS)]
+    marker, colour = style.SERIES[number % len(style.SERIES)]
     return {
         "color": colour,
-        "marker": MARKERS[number % len(MARKERS)],
+        "marker": marker,
         "markerfacecolor": "white" if common else colour,
         "linestyle": "--" if form == "exponential" else "-",
         "linewidth": 0.8,
     }
 
 
-def _draw_kind(axes: Axes, members: Sequence[Tolerated], band: int, number: int) -> None:
+def _draw_kind(axes: style.Axes, members: Sequence[Tolerated], band: int, number: int) -> None:
     law = members[0].law
     look = _look(_kind(law), number)
     curve = 100 * tolerated_sigma(law.terms_at[:, :, band].T, LIMIT)
@@ -166,10 +151,9 @@ def _draw_kind(axes: Axes, members: Sequence[Tolerated], band: int, number: int)
             axes.plot(np.array([0.8, 1.25]) * at, [expected] * 2, **line)
         point = look | {"linestyle": "", "zorder": 2}
         sigma, error = 100 * found.sigma[band], 100 * found.sigma_error[band]
-        if np.isfinite(error):
-            axes.errorbar(at, sigma, yerr=SIGMAS_95 * error, elinewidth=0.6, **point)
-        else:
-            axes.errorbar(at, min(sigma, HIGHEST), yerr=0.4 * sigma, lolims=True, elinewidth=0.6, **point)
+        known = np.isfinite(error)
+        size, bar = (sigma, SIGMAS_95 * error) if known else (min(sigma, HIGHEST), 0.4 * sigma)
+        axes.errorbar(at, size, yerr=bar, lolims=not known, elinewidth=0.6, **point)
 
 
 def _place(law: GainBias) -> float:
@@ -177,7 +161,7 @@ def _place(law: GainBias) -> float:
     return (law.length or WHITE * float(law.lengths[0])) / 1e6
 
 
-def _scale(axes: Axes, worlds: Sequence[Tolerated]) -> None:
+def _scale(axes: style.Axes, worlds: Sequence[Tolerated]) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     smallest = min(float(np.nanmin(100 * found.sigma, initial=HIGHEST)) for found in worlds)
@@ -188,7 +172,7 @@ def _scale(axes: Axes, worlds: Sequence[Tolerated]) -> None:
     axes.set_xlabel("correlation length (MHz)")
 
 
-def _name(published: Sequence[PublishedTolerance], axes: Axes) -> None:
+def _name(published: Sequence[PublishedTolerance], axes: style.Axes) -> None:
     """Name the dotted lines on the right of a panel, from below; names that would overlap move up."""
     lowest, highest = np.log10(axes.get_ylim())
     above = -np.inf
@@ -197,16 +181,9 @@ def _name(published: Sequence[PublishedTolerance], axes: Axes) -> None:
         if not 0 <= at <= 1:
             continue
         above = max(at, above + APART)
-        axes.annotate(
-            f"{line.name}: {100 * line.rms:g} %",
-            (1, above),
-            (3, 0),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            size=style.NOTE_SIZE,
-            color=style.GREY,
-            va="center",
-        )
+        text = f"{line.name}: {100 * line.rms:g} %"
+        look: dict[str, Any] = {"size": style.NOTE_SIZE, "color": style.GREY, "va": "center"}
+        axes.annotate(text, (1, above), (3, 0), xycoords="axes fraction", textcoords="offset points", **look)
 
 
 def _rounding(arrays: Arrays, name: str) -> np.ndarray:
@@ -230,6 +207,7 @@ class GainTolerance(StudyFigure):
     )
 
     of = ("comparison",)
+    products: ClassVar = {"": score, "law": gain_bias}
     caption = (
         "The rms of the real part of gain errors at which their bias is a tenth of the EoR, if nothing is calibrated: "
         "measured (points, 95 % bars; arrows: lower limits) and by the law (lines)."
@@ -241,10 +219,6 @@ class GainTolerance(StudyFigure):
         """Return the caption with the sources and reasons of the published tolerances."""
         lines = [f"{line.name} ({line.source}): {line.reason}" for line in self.published]
         return f"{self.caption} Dotted lines: {'; '.join(lines)}." if lines else self.caption
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the scores of one case and its law; raises InputError if the law is not of its effects."""
-        return {"": required(score(graph)), "law": gain_bias(graph)}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the first calibrator, which must not change the data, in all worlds."""

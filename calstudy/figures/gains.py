@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,14 +12,8 @@ from calstudy.instrument.layouts import make_layout
 from calstudy.plotting import style
 from calstudy.plotting.axes import TwoDomains, delay_panel, frequency_and_delay, in_two_domains
 from calstudy.products import corruption
-from calstudy.products.graph import Graph
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, departure_from_mean, rms_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 ANTENNA_COLOURS = ((style.BLUE, "#003A5C"), (style.ORANGE, "#7A5300"))
 """Colours of true and of recovered gains, for each antenna."""
@@ -31,14 +24,9 @@ RATIO_LOOK: dict[str, Any] = {"color": style.BLACK, "linestyle": ":"}
 
 @dataclass(frozen=True)
 class GainComparison:
-    """Gains of two antennas at one integration, in frequency and delay.
+    """Gains of two antennas at one integration: injected, as fitted, their difference, and that of aligned solutions.
 
-    Attributes
-    ----------
-    antennas : the two antenna numbers
-    true, recovered, residual : injected gains, solutions as fitted and true - recovered, spectra of shape (2, Nfreqs)
-    aligned_residual : true gains less the solutions that are aligned with them, free of what no fit can know
-    correction : the gain-correction ratio g_a g_b* / (ĝ_a ĝ_b*) - 1 of the baseline between them, as fitted, (Nfreqs,)
+    Spectra are (2, Nfreqs); the `correction`, (Nfreqs,), is g_a g_b* / (ĝ_a ĝ_b*) - 1 of their baseline, as fitted.
     """
 
     antennas: tuple[int, int]
@@ -57,30 +45,22 @@ def compare_gains(
     They are injected, as fitted, and fitted with the scale and the phase of each channel that come closest to the
     truth. Where there is no solution all are zero.
     """
-    products = [gains[0] * np.conj(gains[1]) for gains in (true, recovered)]
-    known = products[1] != 0
-    ratio = np.divide(products[0], products[1], out=np.ones(frequency.size, complex), where=known) - 1
-    spectra = (
-        in_two_domains(frequency, values) for values in (true, recovered, true - recovered, true - aligned, ratio)
-    )
-    return GainComparison(antennas, *spectra)
+    injected, fitted = (gains[0] * np.conj(gains[1]) for gains in (true, recovered))
+    ratio = np.divide(injected, fitted, out=np.ones(frequency.size, complex), where=fitted != 0) - 1
+    spectra = (true, recovered, true - recovered, true - aligned, ratio)
+    return GainComparison(antennas, *(in_two_domains(frequency, values) for values in spectra))
 
 
 @style.journal_style()
-def draw_gains(comparison: GainComparison) -> Figure:
-    """Draw real parts against frequency (left) and transforms' amplitudes against delay (right).
-
-    True gains are solid, recovered dashed, residuals as fitted dotted, and aligned thin and solid; the gain-correction
-    ratio is black and dotted.
-    """
+def draw_gains(comparison: GainComparison) -> style.Figure:
+    """Draw real parts against frequency (left) and transforms' amplitudes against delay (right)."""
     figure, (*gains, as_fitted, aligned), delays = frequency_and_delay(rows=4)
-    for index, (bright, dark) in enumerate(ANTENNA_COLOURS):
-        true, recovered, residual, aligned_residual = _looks(bright, dark)
-        axes = gains[index]
-        _draw_both(axes, delays, comparison.true, index, true)
-        _draw_both(axes, delays, comparison.recovered, index, recovered)
-        _draw_both(as_fitted, delays, comparison.residual, index, residual)
-        _draw_both(aligned, delays, comparison.aligned_residual, index, aligned_residual)
+    shown = (comparison.true, comparison.recovered, comparison.residual, comparison.aligned_residual)
+    for index, (axes, colours) in enumerate(zip(gains, ANTENNA_COLOURS, strict=True)):
+        panels = (axes, axes, as_fitted, aligned)
+        for panel, spectra, look in zip(panels, shown, _looks(*colours), strict=True):
+            panel.plot(spectra.frequency / 1e6, spectra.real[index], **look)
+            delays.plot(spectra.delay * 1e9, np.abs(spectra.transform[index]), **look)
         axes.set_ylabel(rf"Re $g_{{{comparison.antennas[index]}}}$")
     ratio = comparison.correction
     as_fitted.plot(ratio.frequency / 1e6, ratio.real, **RATIO_LOOK)
@@ -102,12 +82,7 @@ def _looks(bright: str, dark: str) -> tuple[dict[str, Any], ...]:
     )
 
 
-def _draw_both(axes: Axes, delays: Axes, spectra: TwoDomains, index: int, look: dict[str, Any]) -> None:
-    axes.plot(spectra.frequency / 1e6, spectra.real[index], **look)
-    delays.plot(spectra.delay * 1e9, np.abs(spectra.transform[index]), **look)
-
-
-def _add_legend(figure: Figure, antennas: tuple[int, int]) -> None:
+def _add_legend(figure: style.Figure, antennas: tuple[int, int]) -> None:
     names = ("true", "recovered, as fitted", "residual as fitted", "residual aligned")
     handles = [
         style.entry(label=rf"$g_{{{number}}}$ {name}", **look)
@@ -157,11 +132,10 @@ class Gains(InspectedFigure):
 
 
 @style.journal_style()
-def draw_reflections(gains: TwoDomains) -> Figure:
-    """Draw the amplitude of the transform of every antenna's gain, and their median, in one column.
+def draw_reflections(gains: TwoDomains) -> style.Figure:
+    """Draw the amplitude of the transform of every antenna's gain, (Nants, Nfreqs), and their median, in one column.
 
-    Gains are (Nants, Nfreqs), see `calstudy.plotting.axes.in_two_domains`. Eq. REFGAIN has its peaks at positive
-    delays.
+    Eq. REFGAIN has its peaks at positive delays.
     """
     amplitude = np.abs(gains.transform)
     figure = style.new_figure(style.ONE_COLUMN, 2.7)
@@ -186,11 +160,8 @@ class Reflections(StudyFigure):
 
     caption = "Delay transform of the true gains."
     shows_sky = False
+    products: ClassVar = {"gains": corruption.gains}
     sections = ("outputs.inspect.integration",)
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the true gains."""
-        return {"gains": corruption.gains(graph)}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the delay transforms of the true gains."""

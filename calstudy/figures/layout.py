@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,11 +13,6 @@ from calstudy.instrument.layouts import make_layout
 from calstudy.instrument.settings import Layout as LayoutSettings
 from calstudy.plotting import style
 from calstudy.run.task import Job
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 NUMBERED_ANTENNAS = 64
 """Largest number of antennas that are drawn with their numbers."""
@@ -37,7 +32,7 @@ class LayoutPanel:
 
 
 @style.journal_style()
-def draw_layouts(panels: Sequence[LayoutPanel]) -> Figure:
+def draw_layouts(panels: Sequence[LayoutPanel]) -> style.Figure:
     """Draw one or two arrays, east to the right and north up, in equal scales."""
     width, height = (style.ONE_COLUMN, 3.4) if len(panels) == 1 else (style.TWO_COLUMNS, 3.8)
     figure = style.new_figure(width, height)
@@ -46,7 +41,7 @@ def draw_layouts(panels: Sequence[LayoutPanel]) -> Figure:
     return figure
 
 
-def _draw_array(axes: Axes, panel: LayoutPanel) -> None:
+def _draw_array(axes: style.Axes, panel: LayoutPanel) -> None:
     from scipy.spatial.distance import pdist
 
     numbers, east_north = panel.numbers, panel.enu[:, :2]
@@ -87,7 +82,7 @@ class Layout(StudyFigure):
 
     caption = "The array."
     shows_sky = False
-    needs_products = False
+    products: ClassVar = {}
     sections = ("instrument.layout",)
 
     def draw(self, job: Job) -> Drawing:
@@ -105,7 +100,7 @@ class Layouts(StudyFigure):
     caption = "The two arrays."
     titles = TWO_ARRAYS
     shows_sky = False
-    needs_products = False
+    products: ClassVar = {}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the arrays from left to right."""

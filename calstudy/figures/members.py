@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -12,35 +11,29 @@ from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.figures import Drawing, StudyFigure, members_of
 from calstudy.figures.comparison import look
-from calstudy.figures.spherical import Marking, SphericalColumn, draw_band, draw_points, read_column, shifted
+from calstudy.figures.spherical import (
+    Marking,
+    SphericalColumn,
+    add_legend,
+    draw_band,
+    draw_points,
+    legend_entries,
+    read_column,
+    shifted,
+)
 from calstudy.plotting import style
-from calstudy.products.graph import Graph, required
 from calstudy.products.score import score
 from calstudy.results.reader import Tables
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES, Drawn, Rules, own_error
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
+    from calstudy.power.score import Score
     from calstudy.power.spectra import SphericalSpectrum
 
 
-@dataclass(frozen=True)
-class MemberBias:
-    """Bias of a calibration outside the wedge, s^2 P^R0 / P^S, (Nk,), free of the flux scale s.
-
-    The error is by leaving out antennas; NaN in bins of one baseline or group. `k` are the centres of the bins, h/Mpc.
-    """
-
-    k: np.ndarray
-    bias: np.ndarray
-    bias_error: np.ndarray
-
-
 @style.journal_style()
-def draw_member_bias(members: Mapping[str, MemberBias]) -> Figure:
+def draw_member_bias(members: Mapping[str, Score]) -> style.Figure:
     """Draw |bias| against k, or, where it is within its 95 % error, the 95 % upper limit as an open symbol."""
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     axes = figure.subplots()
@@ -72,21 +65,20 @@ class MemberBiasFigure(StudyFigure):
 
     kind: str = "member-bias"
     of = ("collection",)
+    products: ClassVar = {"score": score}
     caption = (
         "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "
         "where it is not above its error. The dashed line is the EoR."
     )
     tolerances: ClassVar[Rules] = ((r".*\.bias", Drawn(own_error, "noise and what calibration leaves")),)
 
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the scores of a member."""
-        return {"score": required(score(graph))}
-
     def draw(self, job: Job) -> Drawing:
         """Draw all members."""
-        bins = {name: Tables((found["score"],)).score for name, found in members_of(job).items()}
-        members = {name: MemberBias(found.k, found.bias, found.bias_error) for name, found in bins.items()}
-        return Drawing(draw_member_bias(members), members)
+        members = {name: Tables((found["score"],)).score for name, found in members_of(job).items()}
+        shown = {
+            name: {"k": found.k, "bias": found.bias, "bias_error": found.bias_error} for name, found in members.items()
+        }
+        return Drawing(draw_member_bias(members), shown)
 
 
 ROWS = {"residual": r"$|P^{R}|$", "residual_without_eor": r"$|P^{R}|$, no EoR"}
@@ -104,12 +96,10 @@ ARRAYS = {
 
 
 @style.journal_style()
-def draw_solver_comparison(arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]]) -> Figure:
-    """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
+def draw_solver_comparison(arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]]) -> style.Figure:
+    """Draw P^R, and below it P^R without EoR: a column for each array, by title, of the paper's solver and the default.
 
-    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ; the dotted line
-    is 1.96 σ of the thermal noise. `arrays` has, by title, the spectra with the paper's solver and with the default
-    one; power in mK² h⁻³ Mpc³, k in h/Mpc.
+    Markers, bars and band are those of `draw_spherical`; the dotted line is 1.96 σ of the thermal noise.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 5.6)
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
@@ -125,11 +115,12 @@ def draw_solver_comparison(arrays: Mapping[str, tuple[SphericalColumn, Spherical
         row[0].set(xscale="log", yscale="log", xlim=(0.9 * first, LAST_K), ylim=_limits(shown, name))
         row[0].set_ylabel(rf"{ROWS[name]} ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
-    _add_legend(figure)
+    noise = {"thermal noise, 95%": style.entry(linestyle=":", color=style.GREY, linewidth=0.9)}
+    add_legend(figure, legend_entries(SOLVERS, noise), ncols=5)
     return figure
 
 
-def _draw_panel(axes: Axes, solvers: Sequence[SphericalColumn], name: str) -> None:
+def _draw_panel(axes: style.Axes, solvers: Sequence[SphericalColumn], name: str) -> None:
     draw_band(axes, solvers[0].eor)
     noise: SphericalSpectrum = getattr(solvers[0], name)
     axes.plot(noise.k, SIGMAS_95 * noise.noise_error, ":", color=style.GREY, linewidth=0.9, zorder=1, label="noise")
@@ -153,23 +144,10 @@ def _limits(shown: Sequence[SphericalColumn], name: str) -> tuple[float, float]:
     return 0.1 * float(low), 2 * max(highest, *(float(np.nanmax(band)) for band in bands))
 
 
-def _add_legend(figure: Figure) -> None:
-    from matplotlib.patches import Patch
-
-    handles: list[Any] = [marking.handle for marking in SOLVERS]
-    handles.append((Patch(color=style.BAND), style.entry(color=style.GREY, linewidth=0.7)))
-    handles.append(style.entry(linestyle=":", color=style.GREY, linewidth=0.9))
-    handles.append(style.entry(linestyle="none", **style.OPEN_MARKER))
-    labels = [*(marking.label for marking in SOLVERS), r"$P^{S}$, 95% sample variance"]
-    labels += [r"thermal noise, 95%", r"open: $P < 0$"]
-    figure.legend(handles, labels, loc="outside upper center", ncols=5, columnspacing=1.0, handletextpad=0.3)
-
-
 class SolverComparison(StudyFigure):
     """P^R outside the wedge with the paper's solver and the default one, with EoR and without, of one array or both.
 
-    The members in the roles `paper_solver` and `redundant_paper_solver` have the paper's solver, those in the roles
-    `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
+    An array is shown if both of its roles are played, of the member with the paper's solver and with the default one.
     """
 
     kind: str = "solver-comparison"
@@ -192,7 +170,7 @@ class SolverComparison(StudyFigure):
 
     def _read(self, job: Job, role: str) -> SphericalColumn:
         found = read_column(job.inputs[f"spectra:{role}"], self.titles[role], "outside-wedge")
-        missing = [name for name in ROWS if getattr(found, name) is None]
-        if missing:
+        shown = found.series(tuple(ROWS))
+        if missing := [name for name in ROWS if name not in shown]:
             raise InputError(f"figure {self.label!r}: the member in the role {role} has no variant {missing[0]}")
-        return SphericalColumn(found.title, found.eor, **{name: getattr(found, name) for name in ROWS})
+        return SphericalColumn(found.title, found.eor, **shown)

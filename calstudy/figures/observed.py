@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -23,8 +23,6 @@ from calstudy.verdicts.standing import HIGHEST, LOWEST
 from calstudy.verdicts.tolerances import Drawn, half
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from calstudy.power.spectra import SphericalSpectrum
 
 
@@ -37,12 +35,10 @@ COLUMNS = {"all-modes": "all modes", "outside-wedge": "outside wedge + {:.0f} ns
 
 
 @style.journal_style()
-def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer: float) -> Figure:
-    """Draw |P| of measured data over all modes and outside the wedge, open where negative.
+def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer: float) -> style.Figure:
+    """Draw |P| of measured data, mK² h⁻³ Mpc³, with 95 % bars of the noise, open where negative; see `COLUMNS`.
 
-    Bars are 95 % by the noise; the grey line is one standard deviation of the noise of the residual. The columns
-    "all-modes" and "outside-wedge" have the series of `MARKINGS`, in mK² h⁻³ Mpc³; the wedge ends at the horizon plus
-    `buffer`, s.
+    The grey line is one standard deviation of the noise of the residual. The wedge ends `buffer`, s, above the horizon.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
     grid = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]
@@ -55,13 +51,12 @@ def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer
         axes.set(xlabel=style.WAVENUMBER, xscale="log", yscale="log", ylim=_limits(columns))
         style.label_one_two_five(axes.xaxis)
     grid[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
-    handles = [
-        axes.plot([], [], linestyle="none", marker=mark.marker, color=mark.colour, label=mark.label)[0]
-        for mark in MARKINGS.values()
-    ]
-    handles.append(axes.plot([], [], color=style.GREY, label=r"noise of the residual, 1 $\sigma$")[0])
-    handles.append(axes.plot([], [], linestyle="none", label=r"open: $P < 0$", **style.OPEN_MARKER)[0])
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    entries = {
+        mark.label: style.entry(linestyle="none", marker=mark.marker, color=mark.colour) for mark in MARKINGS.values()
+    }
+    entries[r"noise of the residual, 1 $\sigma$"] = style.entry(color=style.GREY)
+    entries[r"open: $P < 0$"] = style.entry(linestyle="none", **style.OPEN_MARKER)
+    figure.legend(list(entries.values()), list(entries), loc="outside upper center", ncols=len(entries))
     return figure
 
 
@@ -79,15 +74,12 @@ class ObservedSpherical(StudyFigure):
     kind: str = "observed-spherical"
 
     of = ("observed",)
+    products: ClassVar = {"spectra": observed_spectra}
     caption = (
         "Spherical power spectra of the measured data, even x odd, with 95 % bars of the noise alone; open where "
         "negative."
     )
     tolerances = ((r".*\.(power|noise_error)", Drawn(half, "follows from fitted gains; half of it")),)
-
-    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
-        """Return the averaged spectra."""
-        return {"spectra": observed_spectra(graph)}
 
     def draw(self, job: Job) -> Drawing:
         """Draw a column for each choice of modes."""
@@ -111,15 +103,12 @@ class ObservedWedge(StudyFigure):
     kind: str = "observed-wedge"
 
     of = ("observed",)
+    products: ClassVar = {"spectra": observed_spectra}
     caption = (
         "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of their "
         "noise from the difference of the two halves; negative values in blue."
     )
     tolerances = ((r".*\.power", Drawn(half, "follows from fitted gains; half of it")),)
-
-    def inputs(self, graph: MeasuredGraph) -> Mapping[str, Task]:
-        """Return the averaged spectra."""
-        return {"spectra": observed_spectra(graph)}
 
     def draw(self, job: Job) -> Drawing:
         """Draw a panel for each spectrum."""
@@ -130,11 +119,8 @@ class ObservedWedge(StudyFigure):
 
 
 @style.journal_style()
-def draw_observed_loss(loss: SignalLoss, buffer: float) -> Figure:
-    """Draw T per |k| on the left, with the expectation outside the wedge as a line, and per (|b|, tau) on the right.
-
-    Bars are 95 % (1.96 sigma). The dashed line is the horizon plus `buffer`, s.
-    """
+def draw_observed_loss(loss: SignalLoss, buffer: float) -> style.Figure:
+    """Draw T as in `calstudy.figures.signal_loss`, with the expectation outside the wedge as a line."""
     where = f"wedge + {1e9 * buffer:.0f} ns"
     figure, axes = draw_loss(loss, f"injected, {{}} {where}", buffer)
     if loss.expected is not None:

@@ -6,7 +6,6 @@ wedge of F alone, P(k) of S alone over its input, and delay spectra of baselines
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
@@ -20,9 +19,9 @@ from calstudy.base.visibilities import antenna_pairs, baseline_vectors, to_cube
 from calstudy.corrupt.levels import eor_factor, rms
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
-from calstudy.figures.wedge import EMPTY, POSITIVE, colour_map
+from calstudy.figures.wedge import POSITIVE, colour_map
 from calstudy.plotting import style
-from calstudy.plotting.axes import MAX_DELAY, cells, draw_horizon, label_axes
+from calstudy.plotting.axes import MAX_DELAY, draw_cells, draw_horizon, horizon_lines, label_axes, name_horizon
 from calstudy.power.binned import cylindrical_average, spherical_average, with_errors
 from calstudy.power.cosmology import input_power
 from calstudy.power.delay import delay_transform, delays, horizon_delay
@@ -30,13 +29,10 @@ from calstudy.power.interface import estimate_spectra
 from calstudy.power.spectra import CylindricalSpectrum, DelaySpectra, SphericalSpectrum
 from calstudy.products import simulation
 from calstudy.products.files import VISIBILITIES, read_visibilities
-from calstudy.products.graph import Graph, required
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.sky.counts import FREQUENCY, differential_counts
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from pyradiosky import SkyModel
     from pyuvdata import UVData
 
@@ -51,26 +47,15 @@ FAINT, BRIGHT = 0.1, 4.0
 
 @dataclass(frozen=True)
 class SourceCounts:
-    """Differential counts at 200 MHz south of +30 degrees and more than 10 degrees from the Galactic plane.
+    """Counts at 200 MHz south of +30 degrees and more than 10 degrees from the Galactic plane, an `area` in sr.
 
-    `edges` (Nbins + 1,) are flux densities in Jy, and `area` is in sr. `expected` is the number of sources in each bin
-    (Nbins,) according to Franzen et al. (2019).
+    `edges` are flux densities in Jy, (Nbins + 1,); `expected` is the `number` of Franzen et al. (2019), (Nbins,).
     """
 
     edges: np.ndarray
     number: np.ndarray
     expected: np.ndarray
     area: float
-
-    @property
-    def flux(self) -> np.ndarray:
-        """Geometric centres of the bins, (Nbins,), Jy."""
-        return np.sqrt(self.edges[:-1] * self.edges[1:])
-
-    @property
-    def density(self) -> np.ndarray:
-        """dN/dS, (Nbins,), 1/(Jy sr)."""
-        return self.number / (self.area * np.diff(self.edges))
 
     @property
     def ratio(self) -> np.ndarray:
@@ -85,6 +70,9 @@ class SourceCounts:
 
 def count_sources(sky: SkyModel) -> SourceCounts:
     """Count point sources in bins of equal logarithmic width; those with flat spectra at their flux density."""
+    import healpy
+    from astropy.coordinates import SkyCoord
+
     from calstudy.sky.foregrounds import in_complete_area
     from calstudy.sky.spectra import at_frequencies
 
@@ -98,43 +86,30 @@ def count_sources(sky: SkyModel) -> SourceCounts:
     fine = np.geomspace(FAINT, BRIGHT, BINS * POINTS_PER_BIN + 1)
     density = differential_counts(fine)
     steps = np.diff(fine) * (density[:-1] + density[1:]) / 2
-    area = _area()
-    return SourceCounts(
-        edges=edges,
-        number=np.histogram(flux[inside], edges)[0],
-        expected=area * steps.reshape(BINS, -1).sum(axis=1),
-        area=area,
-    )
-
-
-def _area() -> float:
-    import healpy
-    from astropy.coordinates import SkyCoord
-
-    from calstudy.sky.foregrounds import in_complete_area
-
     longitude, latitude = healpy.pix2ang(AREA_NSIDE, np.arange(healpy.nside2npix(AREA_NSIDE)), lonlat=True)
     pixels = SkyCoord(longitude, latitude, unit="deg", frame="icrs")
-    return float(4 * np.pi * in_complete_area(pixels).mean())
+    area = float(4 * np.pi * in_complete_area(pixels).mean())
+    number = np.histogram(flux[inside], edges)[0]
+    return SourceCounts(edges, number, expected=area * steps.reshape(BINS, -1).sum(axis=1), area=area)
 
 
 @style.journal_style()
-def draw_counts(counts: SourceCounts) -> Figure:
+def draw_counts(counts: SourceCounts) -> style.Figure:
     """Draw Euclidean-normalized counts above, and their ratio to Franzen et al. (2019) with a band of 5 % below."""
     figure = style.new_figure(style.ONE_COLUMN, 3.6)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     curve = np.geomspace(counts.edges[0], counts.edges[-1], 200)
-    scale = counts.flux**2.5
-    error = counts.error * counts.expected / (counts.area * np.diff(counts.edges))
+    flux = np.sqrt(counts.edges[:-1] * counts.edges[1:])
+    scale = flux**2.5 / (counts.area * np.diff(counts.edges))
     upper.plot(curve, curve**2.5 * differential_counts(curve), color=style.BLACK, label="Franzen et al. (2019)")
-    upper.errorbar(
-        counts.flux, scale * counts.density, scale * error, fmt="o", color=style.BLUE, label="sources of this sky"
-    )
+    look = {"fmt": "o", "color": style.BLUE}
+    error = scale * np.sqrt(counts.expected)
+    upper.errorbar(flux, scale * counts.number, error, label="sources of this sky", **look)
     upper.set(xscale="log", yscale="log", ylabel=r"$S^{5/2}\,dN/dS$ (Jy$^{3/2}$ sr$^{-1}$)")
     upper.legend(loc="lower right")
     lower.axhspan(1 - TOLERANCE, 1 + TOLERANCE, color=style.BAND, linewidth=0)
     lower.axhline(1, color=style.BLACK, linewidth=0.7)
-    lower.errorbar(counts.flux, counts.ratio, counts.error, fmt="o", color=style.BLUE)
+    lower.errorbar(flux, counts.ratio, counts.error, **look)
     largest = max(2 * TOLERANCE, 1.1 * float(np.abs(counts.ratio - 1).max() + counts.error.max()))
     lower.set(xlabel="flux density at 200 MHz (Jy)", ylabel="ratio", ylim=(1 - largest, 1 + largest))
     return figure
@@ -147,7 +122,7 @@ class SourceCountsFigure(StudyFigure):
 
     caption = "Differential source counts at 200 MHz, and their ratio to those of Franzen et al. (2019)."
     needs_foregrounds = True
-    needs_products = False
+    products: ClassVar = {}
     sections = ("sky", "instrument")
 
     def draw(self, job: Job) -> Drawing:
@@ -169,9 +144,9 @@ WAVENUMBERS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, np.inf)
 
 @dataclass(frozen=True)
 class BaselineDelays:
-    """Rms over integrations of one baseline's delay transforms, first polarization, Jy Hz.
+    """Rms over integrations of one baseline's delay transforms, first polarization, Jy Hz; S at its level in the data.
 
-    `delay` is ascending, in s, and `length` is |b| in m. S is scaled to the level that the experiment adds to the data.
+    `delay` is ascending, in s, and `length` is |b| in m.
     """
 
     antennas: tuple[int, int]
@@ -183,12 +158,10 @@ class BaselineDelays:
 
 @dataclass(frozen=True)
 class SimulatedComponents:
-    """The simulated components of an experiment, each alone.
+    """The simulated components: the `wedge` of F, and P(k) of S over all modes, `eor`, with its sample variance.
 
-    `wedge` is the cylindrical spectrum of F, and `eor` is P(k) of S as simulated, over all modes, with its sample
-    variance. `expected`, (Nk,), is the P(k) from which S was drawn, at the centres of the bins, mK^2 h^-3 Mpc^3.
-    `baselines` are a short, a median and a long one. `buffer` is the delay beyond the horizon at which the experiment's
-    window starts, s.
+    `expected`, (Nk,), is the P(k) from which S was drawn, mK^2 h^-3 Mpc^3. `buffer` is the delay beyond the horizon at
+    which the experiment's window starts, s.
     """
 
     wedge: CylindricalSpectrum
@@ -198,10 +171,7 @@ class SimulatedComponents:
     buffer: float
 
     def ratio(self, low: float, high: float) -> tuple[float, float]:
-        """Return measured over expected power and its standard deviation, over bins with low < k <= high (h/Mpc).
-
-        Bins are weighted by their independent modes, because the sample variance is the only error.
-        """
+        """Return measured over expected power, weighted by independent modes, and its error, for low < k <= high."""
         modes = self.eor.sample_modes
         chosen = (modes > 0) & (self.eor.k > low) & (self.eor.k <= high)
         weights = modes[chosen]
@@ -212,10 +182,7 @@ class SimulatedComponents:
 
 
 def measure_components(foregrounds: UVData, eor: UVData, experiment: Experiment) -> SimulatedComponents:
-    """Measure the spectra that are drawn, of F and S as simulated, Jy.
-
-    The beam, power section and levels are those of the experiment.
-    """
+    """Measure the spectra that are drawn, of F and S as simulated, Jy, with the settings of the experiment."""
     settings = experiment.power
     factor = eor_factor(rms(to_cube(foregrounds)), rms(to_cube(eor)), experiment.corruption.eor_level)
     of_foregrounds, of_eor = (_delay_spectra(data, experiment) for data in (foregrounds, eor))
@@ -243,25 +210,16 @@ def _baselines(foregrounds: UVData, eor: UVData, factor: float, taper: str) -> t
     chosen = np.argsort(lengths, kind="stable")[[round(part * (len(lengths) - 1)) for part in LENGTHS]]
     frequencies = foregrounds.freq_array
     delay = delays(len(frequencies), float(np.diff(frequencies).mean()))
-
-    def spectrum(data: UVData, index: int) -> np.ndarray:
-        transform = delay_transform(to_cube(data)[:, index, :, 0], frequencies, taper)
-        return np.sqrt(np.mean(np.abs(transform) ** 2, axis=0))
-
+    transforms = (delay_transform(to_cube(data)[:, chosen][..., 0], frequencies, taper) for data in (foregrounds, eor))
+    of_foregrounds, of_eor = (np.sqrt(np.mean(np.abs(transform) ** 2, axis=0)) for transform in transforms)
     return tuple(
-        BaselineDelays(
-            antennas=tuple(antenna_pairs(foregrounds)[index].tolist()),
-            length=float(lengths[index]),
-            delay=delay,
-            foregrounds=spectrum(foregrounds, index),
-            eor=factor * spectrum(eor, index),
-        )
-        for index in chosen
+        BaselineDelays(tuple(antenna_pairs(foregrounds)[index].tolist()), float(lengths[index]), delay, *spectra)
+        for index, *spectra in zip(chosen, of_foregrounds, factor * of_eor, strict=True)
     )
 
 
 @style.journal_style()
-def draw_components(components: SimulatedComponents) -> Figure:
+def draw_components(components: SimulatedComponents) -> style.Figure:
     """Draw the wedge of F and P(k) of S above, and delay spectra of a short, a median and a long baseline below."""
     figure = style.new_figure(style.TWO_COLUMNS, 5.2)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1)).ravel()
@@ -277,26 +235,24 @@ def draw_components(components: SimulatedComponents) -> Figure:
     return figure
 
 
-def _draw_wedge(figure: Figure, axes: Axes, components: SimulatedComponents) -> None:
+def _draw_wedge(figure: style.Figure, axes: style.Axes, components: SimulatedComponents) -> None:
     from matplotlib.colors import LogNorm
 
-    x, y, power = cells(components.wedge, np.abs(components.wedge.power.real))
+    power = np.abs(components.wedge.power.real)
     shown = power[np.isfinite(power) & (power > 0)]
     lowest, highest = 10 ** np.floor(np.log10(np.quantile(shown, 0.01))), 10 ** np.ceil(np.log10(shown.max()))
-    norm = LogNorm(lowest, highest)
-    axes.set_facecolor(EMPTY)
-    filled = np.ma.maximum(np.ma.masked_invalid(power), lowest)
-    mesh = axes.pcolormesh(x, y, filled, norm=norm, cmap=colour_map(POSITIVE), rasterized=True)
+    look = {"norm": LogNorm(lowest, highest), "cmap": colour_map(POSITIVE)}
+    mesh = draw_cells(axes, components.wedge, np.maximum(power, lowest), **look)
     draw_horizon(axes, components.wedge, components.buffer)
     label_axes(axes, components.wedge)
     axes.set_ylabel(style.K_PARALLEL)
-    axes.legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
+    name_horizon(axes)
     bar = figure.colorbar(mesh, ax=axes, pad=0.02)
     bar.set_label(rf"$|P^F|$ ({style.POWER_UNIT})")
     bar.ax.tick_params(which="both", direction="out")
 
 
-def _draw_power(axes: Axes, components: SimulatedComponents) -> None:
+def _draw_power(axes: style.Axes, components: SimulatedComponents) -> None:
     spectrum = components.eor
     finite = np.isfinite(spectrum.power.real)
     ratio = spectrum.power.real[finite] / components.expected[finite]
@@ -309,12 +265,12 @@ def _draw_power(axes: Axes, components: SimulatedComponents) -> None:
     axes.set_title("bars: 95 % of the sample variance", fontsize=style.SMALL_SIZE)
 
 
-def _draw_baseline(axes: Axes, baseline: BaselineDelays, buffer: float) -> None:
+def _draw_baseline(axes: style.Axes, baseline: BaselineDelays, buffer: float) -> None:
     nanoseconds = baseline.delay * 1e9
     axes.plot(nanoseconds, baseline.foregrounds, color=style.RED, linewidth=0.9, label="$F$")
     axes.plot(nanoseconds, baseline.eor, color=style.BLUE, linewidth=0.7, label="$S$, at the level on the data")
     horizon = float(horizon_delay(baseline.length))
-    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
+    for extra, line, label in horizon_lines(buffer):
         for sign in (-1, 1):
             where = sign * (horizon + extra) * 1e9
             axes.axvline(where, color=style.BLACK, linestyle=line, linewidth=0.6, label=label if sign > 0 else None)
@@ -334,11 +290,8 @@ class SimulatedComponentsFigure(StudyFigure):
 
     caption = "Simulated components alone: wedge of F, P(k) of S over its input, and delay spectra of three baselines."
     needs_foregrounds = True
+    products: ClassVar = {"foregrounds": simulation.foregrounds, "eor": simulation.eor}
     sections = ("instrument", "sky", "corruption", "power")
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return both components."""
-        return {"foregrounds": required(simulation.foregrounds(graph)), "eor": simulation.eor(graph)}
 
     def draw(self, job: Job) -> Drawing:
         """Measure the spectra."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
@@ -21,8 +22,6 @@ from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import SPHERICAL_RULES
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     from calstudy.experiment.model import Experiment
@@ -33,12 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SphericalColumn:
-    """The spherical spectra of one column: one array, one choice of Fourier modes.
-
-    `eor` is P^S with the sample variance as its error (the grey band), `uncorrupted` P^{S+F+N} with perfect gains,
-    `uncalibrated` P^V with gain errors, `residual` P^R, `residual_without_eor` P^R of a simulation of foregrounds and
-    noise only, and `noise` P^N.
-    """
+    """The spherical spectra of one column, one array and choice of Fourier modes: P^S, and those of `MARKINGS`."""
 
     title: str
     eor: SphericalSpectrum
@@ -47,6 +41,10 @@ class SphericalColumn:
     residual: SphericalSpectrum | None = None
     residual_without_eor: SphericalSpectrum | None = None
     noise: SphericalSpectrum | None = None
+
+    def series(self, names: Sequence[str]) -> dict[str, SphericalSpectrum]:
+        """Return the spectra of these names that there are."""
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
 class Marking(NamedTuple):
@@ -81,14 +79,14 @@ LIMIT_MARKERS = ("v", "1", "$\\downarrow$", "P", "X", "*")
 
 
 @style.journal_style()
-def draw_spherical(columns: Sequence[SphericalColumn], limits: Sequence[Limits] = (), z: float = math.nan) -> Figure:
-    """Draw spherical power spectra: full range above, signal and residuals enlarged below.
+def draw_spherical(
+    columns: Sequence[SphericalColumn], limits: Sequence[Limits] = (), z: float = math.nan
+) -> style.Figure:
+    """Draw one or two columns of spherical power spectra: full range above, signal and residuals enlarged below.
 
-    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
-    or two columns, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone (Fig.
-    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³. Published limits are drawn above only; `z` is the redshift of the
-    spectra, which is shown beside theirs. Raise ValueError for a spectrum without any power, or a power without an
-    error bar.
+    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ), the grey band is P^S ± 1.96 σ. Published
+    limits are drawn above only, with the redshift `z` of the spectra. Raises ValueError for a spectrum without any
+    power, or a power without an error bar.
     """
     for column in columns:
         _check(column)
@@ -107,25 +105,23 @@ def draw_spherical(columns: Sequence[SphericalColumn], limits: Sequence[Limits] 
         row[0].set(xscale="log", yscale="log", ylim=ylim, xlim=(first, end))
         row[0].set_ylabel(rf"$|P(k)|$ ({style.POWER_UNIT})")
         style.label_one_two_five(row[0].xaxis)
-    drawn = [_draw_limits(grid[0], found, number) for number, found in enumerate(limits)]
-    title = rf"spectra: $z = {z:.2f}$; limits: $P = 2\pi^2 \Delta^2 / k^3$" if drawn else None
-    _add_legend(figure, columns, drawn, title)
+    entries = legend_entries(MARKINGS[name] for name in LEGEND_ORDER if _present(columns, (name,)))
+    for marker, found in zip(cycle(LIMIT_MARKERS), limits, strict=False):
+        label = f"{found.name}, $z = {found.redshift:g}$"
+        look = {"color": style.GREY, "marker": marker, "markersize": 3.5, "linewidth": 0.6, "zorder": 1.5}
+        for axes in grid[0]:
+            (entries[label],) = axes.plot(found.k, found.power, linestyle=":", label=label, **look)
+    if limits:
+        # Their names are long.
+        title = rf"spectra: $z = {z:.2f}$; limits: $P = 2\pi^2 \Delta^2 / k^3$"
+        add_legend(figure, entries, 5 if len(columns) == 2 else 2, title=title, title_fontsize=7.0)
+    else:
+        add_legend(figure, entries, 7 if len(columns) == 2 else 3)
     return figure
 
 
-def _draw_limits(row: Sequence[Axes], limits: Limits, number: int) -> Line2D:
-    """Draw upper limits of P in several axes, and return the line of the last."""
-    marker, label = LIMIT_MARKERS[number % len(LIMIT_MARKERS)], f"{limits.name}, $z = {limits.redshift:g}$"
-    look: dict[str, Any] = {"color": style.GREY, "marker": marker, "markersize": 3.5, "linewidth": 0.6}
-    lines = [axes.plot(limits.k, limits.power, linestyle=":", label=label, zorder=1.5, **look)[0] for axes in row]
-    return lines[-1]
-
-
 def _check(column: SphericalColumn) -> None:
-    for name in ("eor", *MARKINGS):
-        spectrum = getattr(column, name)
-        if spectrum is None:
-            continue
+    for name, spectrum in column.series(("eor", *MARKINGS)).items():
         finite = np.isfinite(spectrum.power.real)
         if not finite.any():
             raise ValueError(f"column '{column.title}': no power of '{name}' is finite")
@@ -133,15 +129,13 @@ def _check(column: SphericalColumn) -> None:
             raise ValueError(f"column '{column.title}': '{name}' has power without an error bar")
 
 
-def _draw_column(axes: Axes, column: SphericalColumn, names: Sequence[str]) -> None:
+def _draw_column(axes: style.Axes, column: SphericalColumn, names: Sequence[str]) -> None:
     draw_band(axes, column.eor)
-    for name in names:
-        spectrum = getattr(column, name)
-        if spectrum is not None:
-            draw_points(axes, spectrum, MARKINGS[name], name, 2 + list(MARKINGS).index(name))
+    for name, spectrum in column.series(names).items():
+        draw_points(axes, spectrum, MARKINGS[name], name, 2 + list(MARKINGS).index(name))
 
 
-def draw_band(axes: Axes, eor: SphericalSpectrum) -> None:
+def draw_band(axes: style.Axes, eor: SphericalSpectrum) -> None:
     """Draw P^S with its sample variance, the grey band."""
     finite = np.isfinite(eor.power.real)
     power, half = eor.power.real[finite], SIGMAS_95 * eor.error[finite]
@@ -149,30 +143,20 @@ def draw_band(axes: Axes, eor: SphericalSpectrum) -> None:
     axes.plot(eor.k[finite], power, color=style.GREY, linewidth=0.7, zorder=1)
 
 
-def draw_points(axes: Axes, spectrum: SphericalSpectrum, marking: Marking, name: str, zorder: float) -> None:
+def draw_points(axes: style.Axes, spectrum: SphericalSpectrum, marking: Marking, name: str, zorder: float) -> None:
     """Draw |P| with 95 % bars on a logarithmic axis, open where P is negative; `name` labels the artists."""
     power = spectrum.power.real
     k = shifted(spectrum, marking.shift)
     for negative in (False, True):
         chosen = np.isfinite(power) & ((power < 0) == negative)
-        axes.errorbar(
-            k[chosen],
-            np.abs(power[chosen]),
-            yerr=SIGMAS_95 * spectrum.error[chosen],
-            fmt=marking.marker,
-            color=marking.colour,
-            markersize=marking.size,
-            markerfacecolor="white" if negative else marking.colour,
-            ecolor=(marking.colour, 0.55),
-            elinewidth=0.7,
-            zorder=zorder,
-            label=f"{name}, {'negative' if negative else 'positive'}",
-        )
+        look = {"fmt": marking.marker, "color": marking.colour, "markersize": marking.size, "zorder": zorder}
+        look |= {"markerfacecolor": "white" if negative else marking.colour, "ecolor": (marking.colour, 0.55)}
+        label = f"{name}, {'negative' if negative else 'positive'}"
+        style.error_bars(axes, k[chosen], np.abs(power[chosen]), spectrum.error[chosen], label=label, **look)
 
 
 def _present(columns: Sequence[SphericalColumn], names: Sequence[str]) -> list[SphericalSpectrum]:
-    spectra = [getattr(column, name) for column in columns for name in names]
-    return [spectrum for spectrum in spectra if spectrum is not None]
+    return [spectrum for column in columns for spectrum in column.series(names).values()]
 
 
 def magnitudes(spectra: Sequence[SphericalSpectrum]) -> np.ndarray:
@@ -209,30 +193,20 @@ def _k_limits(columns: Sequence[SphericalColumn]) -> tuple[float, float]:
     return 0.85 * float(first), 1.1 * float(last)
 
 
-def _add_legend(
-    figure: Figure, columns: Sequence[SphericalColumn], limits: Sequence[Line2D], title: str | None
-) -> None:
+def legend_entries(markings: Iterable[Marking], more: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return entries of a legend by label: series, the grey band, more of them, and open markers."""
     from matplotlib.patches import Patch
 
-    handles: list[Any] = []
-    labels: list[str] = []
-    for name in LEGEND_ORDER:
-        if _present(columns, (name,)):
-            handles.append(MARKINGS[name].handle)
-            labels.append(MARKINGS[name].label)
-    handles.append((Patch(color=style.BAND), style.entry(color=style.GREY, linewidth=0.7)))
-    labels.append(r"$P^{S}$, 95% sample variance")
-    handles.append(style.entry(linestyle="none", **style.OPEN_MARKER))
-    labels.append(r"open: $P < 0$")
-    spacing: dict[str, Any] = {"columnspacing": 1.0, "handletextpad": 0.3}
-    ncols = 7 if len(columns) == 2 else 3
-    if limits:
-        handles += limits
-        labels += [str(line.get_label()) for line in limits]
-        # Their names are long.
-        ncols = 5 if len(columns) == 2 else 2
-        spacing |= {"title": title, "title_fontsize": 7.0}
-    figure.legend(handles, labels, loc="outside upper center", ncols=ncols, **spacing)
+    band = Patch(color=style.BAND), style.entry(color=style.GREY, linewidth=0.7)
+    series = {marking.label: marking.handle for marking in markings}
+    negative = style.entry(linestyle="none", **style.OPEN_MARKER)
+    return {**series, r"$P^{S}$, 95% sample variance": band, **(more or {}), r"open: $P < 0$": negative}
+
+
+def add_legend(figure: style.Figure, entries: Mapping[str, Any], ncols: int, **title: Any) -> None:
+    """Add a legend above all axes, with entries by label."""
+    spacing = {"columnspacing": 1.0, "handletextpad": 0.3}
+    figure.legend(list(entries.values()), list(entries), loc="outside upper center", ncols=ncols, **spacing, **title)
 
 
 LimitsTable = Annotated[
@@ -242,14 +216,12 @@ LimitsTable = Annotated[
     PlainSerializer(lambda path: PUBLISHED if path == published_limits() else str(path), str, when_used="json"),
 ]
 """A table of limits by its path, or by a word the one that comes with calstudy."""
-SERIES = ("uncorrupted", "uncalibrated", "residual", "residual_without_eor", "eor", "noise")
-"""The variants that are shown if the experiment has them."""
 
 
 def read_column(folder: Path, title: str, modes: str) -> SphericalColumn:
     """Read the spherical spectra of all series of a product of stage `spectra`, for "all-modes" or "outside-wedge"."""
     tables = Tables((folder,))
-    series = {name: tables.spherical(name, modes) for name in tables.variants if name in SERIES}
+    series = {name: tables.spherical(name, modes) for name in tables.variants if name in ("eor", *MARKINGS)}
     return SphericalColumn(title=title, **series)
 
 
@@ -269,6 +241,7 @@ class Spherical(StudyFigure):
     )
 
     caption = "Spherical power spectra with 95 % bars; open where negative."
+    shown: ClassVar = {"all_modes": "all-modes", "excised": "outside-wedge"}
     variants = ("eor",)
     sections = ("power.wedge_buffer",)
     tolerances = SPHERICAL_RULES
@@ -287,9 +260,7 @@ class Spherical(StudyFigure):
 
     def limits_at(self, z: float) -> list[Limits]:
         """Return the limits near a redshift."""
-        if self.limits is None:
-            return []
-        return limits_near(read_limits(self.limits), z)
+        return [] if self.limits is None else limits_near(read_limits(self.limits), z)
 
     def captioned(self) -> str:
         """Return the caption with the sources of the limits."""
@@ -299,23 +270,15 @@ class Spherical(StudyFigure):
         dotted = "Dotted: upper limits near this redshift, if there are some, of a table from"
         return f"{self.caption} {dotted} {'; '.join(sources)}."
 
-    def drawn(self, columns: Mapping[str, SphericalColumn], job: Job) -> Drawing:
-        """Draw the columns with the limits."""
-        z = job.settings.get("redshift", math.nan)
-        limits = self.limits_at(z)
-        figure = draw_spherical(list(columns.values()), limits=limits, z=z)
-        shown = {f"limits.{number}": found for number, found in enumerate(limits)}
-        return Drawing(figure, {**columns, **shown})
-
-    def excised(self, job: Job) -> SphericalColumn:
-        """Read the spectra over the modes outside the wedge."""
-        title = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
-        return read_column(job.inputs["spectra"], title, "outside-wedge")
-
     def draw(self, job: Job) -> Drawing:
-        """Draw a column for each choice of modes."""
-        everything = read_column(job.inputs["spectra"], "all modes", "all-modes")
-        return self.drawn({"all_modes": everything, "excised": self.excised(job)}, job)
+        """Draw a column for each choice of modes, with the limits."""
+        outside = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
+        titles = {"all-modes": "all modes", "outside-wedge": outside}
+        folder, z = job.inputs["spectra"], job.settings.get("redshift", math.nan)
+        columns = {name: read_column(folder, titles[modes], modes) for name, modes in self.shown.items()}
+        limits = self.limits_at(z)
+        figure = draw_spherical(list(columns.values()), limits, z)
+        return Drawing(figure, {**columns, "limits": dict(enumerate(limits))})
 
 
 class SphericalExcised(Spherical):
@@ -324,10 +287,7 @@ class SphericalExcised(Spherical):
     kind: str = "spherical-excised"
 
     caption = "Spherical power spectra outside the wedge with 95 % bars; open where negative."
-
-    def draw(self, job: Job) -> Drawing:
-        """Draw one column."""
-        return self.drawn({"excised": self.excised(job)}, job)
+    shown: ClassVar = {"excised": "outside-wedge"}
 
 
 class SphericalComparison(StudyFigure):

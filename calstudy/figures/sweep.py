@@ -7,25 +7,18 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from calstudy.base.constants import SIGMAS_95
 from calstudy.experiment.files import short_names
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.figures.signal_loss import TRANSFER
 from calstudy.plotting import style
 from calstudy.power.transfer import TransferFunction, pool
 from calstudy.products import signal_loss
-from calstudy.products.graph import Graph, required
 from calstudy.results.reader import Tables
-from calstudy.run.task import Job, Task
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
+from calstudy.run.task import Job
 
 SKIES = "sky.eor.seed"
 """The field whose values are further samples of the same EoR, to be pooled."""
@@ -37,11 +30,7 @@ LABEL_WIDTH = 15
 
 @dataclass(frozen=True)
 class SweepPanel:
-    """Transfer functions outside the wedge for the values of one field, or of the combinations of several.
-
-    `field` is the dotted path of the varied field, and `note` names other changes for the title; it may be empty.
-    `values` are texts as in the file, each with one of `transfers`, all in the same bands of k.
-    """
+    """T outside the wedge for the values of a varied field; `note` names other changes, and may be empty."""
 
     field: str
     note: str
@@ -50,7 +39,7 @@ class SweepPanel:
 
 
 @style.journal_style()
-def draw_sweep(panels: Sequence[SweepPanel]) -> Figure:
+def draw_sweep(panels: Sequence[SweepPanel]) -> style.Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 
     Dashes are T free of the flux scale, which is written above each value (see `calstudy.power.transfer`). There are at
@@ -76,36 +65,22 @@ def draw_sweep(panels: Sequence[SweepPanel]) -> Figure:
     return figure
 
 
-def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
+def _draw_panel(axes: style.Axes, panel: SweepPanel) -> None:
     bands = panel.transfers[0].k.size
     positions = np.arange(len(panel.values))
     for band, (marker, colour) in enumerate(style.SERIES[:bands]):
-        values = np.array([item.transfer[band] for item in panel.transfers])
-        errors = np.array([item.transfer_error[band] for item in panel.transfers])
+        columns = ("transfer", "transfer_error", "scale_free_transfer")
+        values, errors, scale_free = np.array(
+            [[getattr(item, name)[band] for item in panel.transfers] for name in columns]
+        )
         known = np.isfinite(values)
-        shift = 0.1 * (band - (bands - 1) / 2)
-        axes.errorbar(
-            (positions + shift)[known],
-            values[known],
-            yerr=SIGMAS_95 * np.nan_to_num(errors[known]),
-            fmt=marker,
-            color=colour,
-            elinewidth=0.7,
-        )
-        scale_free = np.array([item.scale_free_transfer[band] for item in panel.transfers])
-        axes.plot(positions + shift, scale_free, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
+        at = positions + 0.1 * (band - (bands - 1) / 2)
+        style.error_bars(axes, at[known], values[known], errors[known], fmt=marker, color=colour)
+        axes.plot(at, scale_free, "_", color=colour, markersize=7, linestyle=":", linewidth=0.6)
+    above: dict[str, Any] = {"xytext": (0, -2), "xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+    look: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": style.SMALL_SIZE, "color": style.GREY}
     for position, item in zip(positions, panel.transfers, strict=True):
-        axes.annotate(
-            f"$s$ = {item.flux_scale:.3f}",
-            (position, 1),
-            (0, -2),
-            xycoords=("data", "axes fraction"),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=style.SMALL_SIZE,
-            color=style.GREY,
-        )
+        axes.annotate(f"$s$ = {item.flux_scale:.3f}", (position, 1), **above, **look)
     axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
     axes.set_xlim(-0.5, len(panel.values) - 0.5)
     axes.set_xticks(positions, [textwrap.fill(text, LABEL_WIDTH) for text in panel.values], fontsize=style.SMALL_SIZE)
@@ -114,16 +89,14 @@ def _draw_panel(axes: Axes, panel: SweepPanel) -> None:
     axes.set_title(panel.note)
 
 
-def _add_legend(figure: Figure, axes: Axes, edges: np.ndarray, columns: int) -> None:
+def _add_legend(figure: style.Figure, axes: style.Axes, edges: np.ndarray, columns: int) -> None:
     labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
-    handles: list[Any] = [
-        axes.errorbar([], [], yerr=[], fmt=marker, color=colour, elinewidth=0.7)
-        for (marker, colour), _ in zip(style.SERIES, labels, strict=False)
-    ]
     labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
-    handles.append(style.entry(color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6))
     labels.append("free of the flux scale $s$")
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
+    scale_free = style.entry(color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6)
+    figure.legend(
+        [*axes.containers, scale_free], labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2
+    )
 
 
 class Sweep(StudyFigure):
@@ -133,10 +106,7 @@ class Sweep(StudyFigure):
 
     of = ("sweep",)
     caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the signal loss of one point."""
-        return {"": required(signal_loss.transfer(graph))}
+    products: ClassVar = {"": signal_loss.transfer}
 
     def draw(self, job: Job) -> Drawing:
         """Draw T against the varied fields."""

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from calstudy.base.constants import SIGMAS_95
 from calstudy.base.table import Table
-from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS, Experiment
+from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 from calstudy.power.tables import load_spectrum
 from calstudy.power.windows import UnbiasedSpectrum
 from calstudy.products.comparison import case_name
-from calstudy.products.graph import Graph
 from calstudy.products.unbiased import UNBIASED, unbiased, why_not
-from calstudy.run.task import Job, Task
+from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import Drawn, Rules
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 CSV = "unbiased.csv"
 WITHIN = (1.0, SIGMAS_95)
@@ -37,21 +32,11 @@ ROUTES = {
 
 @dataclass(frozen=True)
 class Recovered:
-    """Spectra of realizations over the mean power of their signals, in bins of k, by three routes.
+    """Means over realizations of spectra over the power of their signals, by the `ROUTES`, (Nk,), in bins of k, h/Mpc.
 
-    Attributes
-    ----------
-    k : centres, h/Mpc, (Nk,)
-    measured, by_flat, unbiased
-        Means over realizations, (Nk,), of P^R, P^R over T of a flat spectrum, and W^-1 P^R; NaN in bins without a
-        result.
-    measured_error, by_flat_error, unbiased_error
-        Their standard errors, (Nk,): by the scatter over realizations of the difference from the power of the signal of
-        the same realization, so that they are free of its sample variance; of a single realization, its own errors.
-    within
-        Fraction of the bins and realizations in which W^-1 P^R is within 1 and 1.96 of its errors of the mean power of
-        the signals, (2,)
-    realizations : their number
+    NaN in bins without a result. Errors are by the scatter of the difference from the power of the same realization's
+    signal, so that they are free of its sample variance; of a single realization, its own. `within`, (2,), are the
+    fractions of bins and realizations in which W^-1 P^R is within 1 and 1.96 errors of the mean power of the signals.
     """
 
     k: np.ndarray
@@ -68,30 +53,24 @@ class Recovered:
 def recovered(found: Sequence[UnbiasedSpectrum]) -> Recovered:
     """Average the spectra of realizations that differ in seeds alone."""
     truth = np.mean([one.signal for one in found], axis=0)
-    routes = {
-        "measured": np.array([one.measured / truth for one in found]),
-        "by_flat": np.array([one.measured / one.flat_transfer / truth for one in found]),
-        "unbiased": np.array([one.power / truth for one in found]),
-    }
     pulls = np.array([(one.power - truth) / one.error for one in found])
     known = np.isfinite(pulls)
-    means = {name: values.mean(axis=0) for name, values in routes.items()}
-    own = np.array([one.signal / truth for one in found])
+    routes = np.array([[one.measured, one.measured / one.flat_transfer, one.power] for one in found]) / truth
     if len(found) == 1:
         [one] = found
-        each = one.measured_error, one.measured_error / one.flat_transfer, one.error
-        errors = {f"{name}_error": error / truth for name, error in zip(routes, each, strict=True)}
+        errors = np.array([one.measured_error, one.measured_error / one.flat_transfer, one.error]) / truth
     else:
-        scatter = {name: (values - own).std(axis=0, ddof=1) for name, values in routes.items()}
-        errors = {f"{name}_error": values / np.sqrt(len(found)) for name, values in scatter.items()}
-    for values in (*means.values(), *errors.values()):
-        values[~known.all(axis=0)] = np.nan
+        own = np.array([one.signal for one in found]) / truth
+        errors = (routes - own[:, None]).std(axis=0, ddof=1) / np.sqrt(len(found))
+    columns = np.where(known.all(axis=0), [*routes.mean(axis=0), *errors], np.nan)
     within = np.array([np.mean(np.abs(pulls[known]) < limit) for limit in WITHIN])
-    return Recovered(found[0].k, **means, **errors, within=within, realizations=len(found))
+    names = [*ROUTES, *(f"{name}_error" for name in ROUTES)]
+    by_name = dict(zip(names, columns, strict=True))
+    return Recovered(found[0].k, **by_name, within=within, realizations=len(found))
 
 
 @style.journal_style()
-def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
+def draw_unbiased(found: UnbiasedSpectrum) -> style.Figure:
     """Draw P^S, P^R and W^-1 P^R with 95 % bars, and beside them the window functions, each over its sum.
 
     Open symbols are the absolute values of negative power.
@@ -100,31 +79,26 @@ def draw_unbiased(found: UnbiasedSpectrum) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     shift = 0.1 * np.diff(found.bin_edges)
     left.step(found.bin_edges, np.append(found.signal, found.signal[-1]), where="post", color=style.BAND, linewidth=3)
-    for place, (name, power, error) in enumerate(
-        (("measured", found.measured, found.measured_error), ("unbiased", found.power, found.error))
-    ):
+    drawn = (("measured", found.measured, found.measured_error, -1), ("unbiased", found.power, found.error, 1))
+    for name, power, error, side in drawn:
         label, marker, colour = ROUTES[name]
-        bars = {"fmt": marker, "color": colour, "elinewidth": 0.7, "label": f"$P^R$, {label}"}
-        k = found.k + (2 * place - 1) * shift
-        left.errorbar(k, np.abs(power), yerr=SIGMAS_95 * error, **bars)
+        k = found.k + side * shift
+        style.error_bars(left, k, np.abs(power), error, fmt=marker, color=colour, label=f"$P^R$, {label}")
         left.plot(k[power < 0], -power[power < 0], marker, color=colour, markerfacecolor="white")
     left.plot([], [], color=style.BAND, linewidth=3, label="$P^S$")
-    left.set(
-        xlabel=style.WAVENUMBER,
-        ylabel=rf"$P$ ({style.POWER_UNIT}), 95 % bars",
-        yscale="log",
-        xlim=(0, found.bin_edges[-1]),
-    )
+    left.set(ylabel=rf"$P$ ({style.POWER_UNIT}), 95 % bars", yscale="log")
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=3)
     known = np.isfinite(found.power)
     for window, total in zip(found.window[known], found.flat_transfer[known], strict=True):
         right.plot(found.k, window / total, linewidth=0.8)
-    right.set(xlabel=style.WAVENUMBER, ylabel="window function", xlim=(0, found.bin_edges[-1]))
+    right.set(ylabel="window function")
+    for axes in (left, right):
+        axes.set(xlabel=style.WAVENUMBER, xlim=(0, found.bin_edges[-1]))
     return figure
 
 
 @style.journal_style()
-def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> Figure:
+def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> style.Figure:
     """Draw the means over realizations, over the power of the signals, with bars of 1.96 standard errors.
 
     A row for each kind of signal, and a column for each calibrator, by their names.
@@ -144,15 +118,15 @@ def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> Figure:
     return figure
 
 
-def _draw_routes(axes: Axes, found: Recovered) -> None:
+def _draw_routes(axes: style.Axes, found: Recovered) -> None:
     axes.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
     width = np.diff(found.k).min() if found.k.size > 1 else 0.0
     for place, (name, (label, marker, colour)) in enumerate(ROUTES.items()):
-        error = SIGMAS_95 * getattr(found, f"{name}_error")
-        k = found.k + 0.15 * (place - 1) * width
-        axes.errorbar(
-            k, getattr(found, name), yerr=error, fmt=marker, color=colour, elinewidth=0.7, label=f"$P^R$, {label}"
+        k, (mean, error) = (
+            found.k + 0.15 * (place - 1) * width,
+            (getattr(found, key) for key in (name, f"{name}_error")),
         )
+        style.error_bars(axes, k, mean, error, fmt=marker, color=colour, label=f"$P^R$, {label}")
 
 
 def _error(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
@@ -179,11 +153,11 @@ class UnbiasedFigure(StudyFigure):
 
     kind: str = "unbiased"
     of = ("experiment", "comparison")
+    products: ClassVar = {"": unbiased}
     caption = (
         "Power spectrum of the residual outside the wedge as measured, and deconvolved with the window functions of "
         "the calibration, beside the EoR, with 95 % bars; open symbols: negative."
     )
-    variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True
     needs_calibration = True
     needs_least_squares = True
@@ -195,14 +169,8 @@ class UnbiasedFigure(StudyFigure):
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
-        if reason := super().refusal(experiment):
-            return reason
-        lacking = why_not(experiment)
-        return None if lacking is None else f"needs {lacking}"
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return the spectrum of a run or a case."""
-        return {"": unbiased(graph)}
+        reason, lacking = super().refusal(experiment), why_not(experiment)
+        return reason or (f"needs {lacking}" if lacking else None)
 
     def draw(self, job: Job) -> Drawing:
         """Draw one spectrum, or the means over the realizations of every calibrator and kind of signal."""

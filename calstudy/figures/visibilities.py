@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,17 +28,10 @@ from calstudy.products.graph import Graph, required
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, rms_of, scatter_of_noise
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 @dataclass(frozen=True)
 class VisibilityComparison:
-    """One baseline at one integration, with spectra (Nfreqs,) in Jy; `baseline_length` is |b| in m.
-
-    The residual is reference - model, and the noise is the thermal noise in the data.
-    """
+    """Spectra of one baseline at one integration in Jy, of which the residual is reference - model; |b| is in m."""
 
     antennas: tuple[int, int]
     baseline_length: float
@@ -48,32 +41,26 @@ class VisibilityComparison:
     noise: TwoDomains
 
 
-class Visibilities(NamedTuple):
-    """Spectra of one baseline at one integration, (Nfreqs,) complex, Jy."""
-
-    reference: np.ndarray
-    model: np.ndarray
-    noise: np.ndarray
-
-
 def compare_visibilities(
-    antennas: tuple[int, int], baseline_length: float, frequency: np.ndarray, visibilities: Visibilities
+    baseline: tuple[tuple[int, int], float],
+    frequency: np.ndarray,
+    reference: np.ndarray,
+    model: np.ndarray,
+    noise: np.ndarray,
 ) -> VisibilityComparison:
-    """Compare visibilities on channels `frequency` (Nfreqs,) Hz; the length |b| is in m."""
-    reference, model, noise = visibilities
+    """Compare visibilities, (Nfreqs,) complex, Jy, on channels in Hz; a baseline is its antennas and |b| in m."""
     spectra = (in_two_domains(frequency, values) for values in (reference, model, reference - model, noise))
-    return VisibilityComparison(antennas, baseline_length, *spectra)
+    return VisibilityComparison(*baseline, *spectra)
 
 
 @style.journal_style()
-def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -> Figure:
-    """Draw real parts against frequency (left) and amplitudes of transforms against delay (right).
+def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -> style.Figure:
+    """Draw real parts against frequency (left), and amplitudes of transforms and the wedge against delay (right).
 
-    The reference is solid, the model dashed, the residual dotted, the noise dash-dotted. Vertical lines are the edges
-    of the wedge. `labels` are the names of reference and model in the legend.
+    `labels` are the names of reference and model in the legend.
     """
     figure, (values, residuals), delays = frequency_and_delay()
-    looks: tuple[tuple[Axes, TwoDomains, str, dict[str, Any]], ...] = (
+    looks: tuple[tuple[style.Axes, TwoDomains, str, dict[str, Any]], ...] = (
         (values, comparison.reference, labels[0], {"color": style.BLACK, "linestyle": "-", "linewidth": 0.8}),
         (values, comparison.model, labels[1], {"color": style.ORANGE, "linestyle": "--", "linewidth": 0.9}),
         (residuals, comparison.noise, "thermal noise", {"color": style.MAGENTA, "linestyle": "-.", "linewidth": 0.8}),
@@ -91,8 +78,8 @@ def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -
     return figure
 
 
-def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], float, Visibilities]:
-    """Return the shown baseline, its length and, in fitted channels, its reference, fitted model and noise."""
+def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[tuple[int, int], float], Iterator[np.ndarray]]:
+    """Return the shown baseline and, in fitted channels, its reference, fitted model and noise."""
     from calstudy.products.selection import baseline, read_spectra, read_used, require_used
 
     integration = job.settings["integration"]
@@ -100,7 +87,7 @@ def _inspected_spectra(job: Job, reference: Path) -> tuple[tuple[int, int], floa
     paths = (reference, job.inputs["calibration"] / MODEL, job.inputs["noise"] / DATA)
     used = read_used(paths[1], [pair])[0, integration]
     require_used(used, pair, integration)
-    return pair, length, Visibilities(*(used * read_spectra(path, [pair])[0, integration] for path in paths))
+    return (pair, length), (used * read_spectra(path, [pair])[0, integration] for path in paths)
 
 
 class Model(InspectedFigure):
@@ -110,6 +97,7 @@ class Model(InspectedFigure):
 
     caption = "Foregrounds of one baseline: true and fitted."
     variants = ("residual", "noise")
+    shown: ClassVar = {"noise": "noise"}
     needs_calibration = True
     tolerances = (
         (r"(model|residual)\..*", Drawn(rms_of("residual"), "the rms error of the model")),
@@ -118,18 +106,15 @@ class Model(InspectedFigure):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return gains, calibration, true foregrounds and noise."""
-        experiment = graph.experiment
-        noise = corruption.data(graph, experiment.variants["noise"], experiment.outputs.inspect.realization)
-        return {**super().inputs(graph), "foregrounds": required(simulation.foregrounds(graph)), "noise": noise}
+        return {**super().inputs(graph), "foregrounds": required(simulation.foregrounds(graph))}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the true foregrounds of a baseline and the fitted ones, on the scale of the true gains."""
         from calstudy.products.selection import read_aligned_gains
 
-        pair, length, (foregrounds, model, noise) = _inspected_spectra(job, job.inputs["foregrounds"] / VISIBILITIES)
+        baseline, (foregrounds, model, noise) = _inspected_spectra(job, job.inputs["foregrounds"] / VISIBILITIES)
         gains = read_aligned_gains(job.inputs["gains"], job.inputs["calibration"], job.settings["integration"])
-        shown = Visibilities(foregrounds, model / gains.scale**2, noise)
-        comparison = compare_visibilities(pair, length, gains.frequency, shown)
+        comparison = compare_visibilities(baseline, gains.frequency, foregrounds, model / gains.scale**2, noise)
         labels = (r"true foregrounds $F$", r"fitted model $\widehat{F}$")
         return Drawing(draw_comparison(comparison, labels), comparison)
 
@@ -141,39 +126,29 @@ class Data(InspectedFigure):
 
     caption = "Data of one baseline, fitted gains times model, and what is left."
     variants = ("residual", "noise")
+    shown: ClassVar = {"data": "residual", "noise": "noise"}
     needs_calibration = True
     tolerances = ((r".*", Drawn(rms_of("noise"), "the rms of the noise")),)
-
-    def inputs(self, graph: Graph) -> Mapping[str, Task]:
-        """Return gains, calibration, data and noise."""
-        experiment = graph.experiment
-        data, noise = (
-            corruption.data(graph, experiment.variants[name], experiment.outputs.inspect.realization)
-            for name in ("residual", "noise")
-        )
-        return {**super().inputs(graph), "data": data, "noise": noise}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the data of a baseline with fitted gains times model, and with the noise in them."""
         from calstudy.products.selection import read_gains
 
-        pair, length, (data, model, noise) = _inspected_spectra(job, job.inputs["data"] / DATA)
+        baseline, (data, model, noise) = _inspected_spectra(job, job.inputs["data"] / DATA)
         true, fitted = read_gains(job.inputs["gains"]), read_gains(job.inputs["calibration"])
-        both = (gains.at(job.settings["integration"], pair) for gains in (true, fitted))
+        both = (gains.at(job.settings["integration"], baseline[0]) for gains in (true, fitted))
         corruption_factor, correction = (gains[0] * gains[1].conj() for gains in both)
-        shown = Visibilities(data, correction * model, corruption_factor * noise)
-        comparison = compare_visibilities(pair, length, fitted.frequency, shown)
+        spectra = data, correction * model, corruption_factor * noise
+        comparison = compare_visibilities(baseline, fitted.frequency, *spectra)
         labels = (r"data $V$", r"model $\hat{g}_a\hat{g}_b^*\widehat{F}$")
         return Drawing(draw_comparison(comparison, labels), comparison)
 
 
 @dataclass(frozen=True)
 class BaselineSpectra:
-    """RMS over integrations of one baseline's delay transforms, each (Ndelays,) real, Jy Hz.
+    """RMS over integrations of one baseline's delay transforms, as in `LINES`, (Ndelays,) real, Jy Hz.
 
-    `data` are the uncalibrated visibilities V, `model` the fitted foregrounds times gains, ĝ_a ĝ_b* F̂, `residual` the
-    calibrated residuals R, and `uncorrupted` S+F+N without gain errors, if they are to be drawn. `baseline_length` is
-    |b| in m; delays are ascending, s.
+    `baseline_length` is |b| in m; delays are ascending, s.
     """
 
     antennas: tuple[int, int]
@@ -196,7 +171,7 @@ LINES: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @style.journal_style()
-def draw_baselines(baselines: Sequence[BaselineSpectra]) -> Figure:
+def draw_baselines(baselines: Sequence[BaselineSpectra]) -> style.Figure:
     """Draw one panel per baseline on common axes, with the edges of the wedge; a single one fills one column."""
     n_columns = min(2, len(baselines))
     n_rows = -(-len(baselines) // n_columns)
@@ -213,12 +188,12 @@ def draw_baselines(baselines: Sequence[BaselineSpectra]) -> Figure:
         lowest = axes if axes.get_visible() else grid[-2, column]
         lowest.set_xlabel(style.DELAY)
         lowest.tick_params(labelbottom=True)
-    handles = grid[0, 0].get_lines()[: sum(getattr(baselines[0], name) is not None for name in LINES)]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3 if n_columns == 1 else 6)
+    entries = grid[0, 0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside upper center", ncols=3 if n_columns == 1 else 6)
     return figure
 
 
-def _draw_baseline(axes: Axes, spectra: BaselineSpectra) -> None:
+def _draw_baseline(axes: style.Axes, spectra: BaselineSpectra) -> None:
     for name, (label, look) in LINES.items():
         values = getattr(spectra, name)
         if values is not None:
@@ -245,12 +220,9 @@ class Baselines(StudyFigure):
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return calibration, data and noise, and uncorrupted data where the experiment has them."""
         variants, realization = graph.experiment.variants, graph.experiment.outputs.inspect.realization
-        names = {"data": "residual", "noise": "noise", "uncorrupted": "uncorrupted"}
-        inputs = {
-            name: corruption.data(graph, variants[variant], realization)
-            for name, variant in names.items()
-            if variant in variants
-        }
+        shown = {"data": "residual", "noise": "noise", "uncorrupted": "uncorrupted"}
+        names = {name: variant for name, variant in shown.items() if variant in variants}
+        inputs = {name: corruption.data(graph, variants[variant], realization) for name, variant in names.items()}
         return {"calibration": calibration.calibration(graph, variants["residual"], realization), **inputs}
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
@@ -271,12 +243,13 @@ class Baselines(StudyFigure):
         sides = ([pair[side] for pair in pairs] for side in (0, 1))
         first, second = (gains.over(residual.shape[1], numbers).swapaxes(0, 1) for numbers in sides)
         model = first * second.conj() * read_spectra(job.inputs["calibration"] / MODEL, pairs)
-        spectra = {"residual": residual, "model": model}
         measured = [name for name in ("data", "noise", "uncorrupted") if name in job.inputs]
-        spectra |= {name: read_spectra(job.inputs[name] / DATA, pairs) for name in measured}
+        data = {name: read_spectra(job.inputs[name] / DATA, pairs) for name in measured}
         used = read_used(job.inputs["calibration"] / RESIDUAL, pairs)
-        transforms = {name: delay_transform(used * values, gains.frequency, TAPER) for name, values in spectra.items()}
-        shown = {name: np.sqrt(np.mean(np.abs(values) ** 2, axis=-2)) for name, values in transforms.items()}
+        shown = {}
+        for name, values in {"residual": residual, "model": model, **data}.items():
+            transform = delay_transform(used * values, gains.frequency, TAPER)
+            shown[name] = np.sqrt(np.mean(np.abs(transform) ** 2, axis=-2))
         delay = delays(gains.frequency.size, channel_width(gains.frequency))
         panels = [
             BaselineSpectra(pair, length, delay, **{name: values[index] for name, values in shown.items()})

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calstudy.plotting import style
 from calstudy.power.delay import channel_width, delay_transform, delays, horizon_delay, make_taper
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.collections import QuadMesh
 
     from calstudy.power.spectra import CylindricalSpectrum
     from calstudy.power.transfer import TransferMap
@@ -29,8 +27,8 @@ MAX_DELAY = 2e-6
 class TwoDomains:
     """One or more complex spectra, (..., Nfreqs), in both domains.
 
-    `frequency` are the channel centres, (Nfreqs,), Hz, and `delay` is ascending, (Nfreqs,), s. `transform` are
-    Blackman-Harris delay transforms in the unit of `values`: a constant spectrum has its own value at zero delay.
+    `frequency` is in Hz, and `delay` ascending in s, (Nfreqs,). `transform` are Blackman-Harris delay transforms in the
+    unit of `values`: a constant spectrum has its own value at zero delay.
     """
 
     frequency: np.ndarray
@@ -49,14 +47,13 @@ def in_two_domains(frequency: np.ndarray, values: np.ndarray) -> TwoDomains:
 
     Raises ValueError if the channels are not equally spaced and ascending or do not match the spectra.
     """
-    values = np.asarray(values)
     width = channel_width(frequency)
     integral = width * make_taper(TAPER, frequency.size).sum()
     transform = delay_transform(values, frequency, TAPER) / integral
     return TwoDomains(frequency, delays(frequency.size, width), values, transform)
 
 
-def frequency_and_delay(rows: int = 2) -> tuple[Figure, list[Axes], Axes]:
+def frequency_and_delay(rows: int = 2) -> tuple[style.Figure, list[style.Axes], style.Axes]:
     """Return a figure with `rows` axes against frequency stacked on the left, and one against delay on the right."""
     figure = style.new_figure(style.TWO_COLUMNS, 1.7 + 0.8 * rows)
     axes = figure.subplot_mosaic([[str(row), "delay"] for row in range(rows)])
@@ -69,18 +66,18 @@ def frequency_and_delay(rows: int = 2) -> tuple[Figure, list[Axes], Axes]:
     return figure, stacked, axes["delay"]
 
 
-def delay_panel(axes: Axes, delay: np.ndarray, label: str) -> None:
+def delay_panel(axes: style.Axes, delay: np.ndarray, label: str) -> None:
     """Set scales and labels of axes of amplitudes against ascending `delay` (Ndelays,) s."""
     axes.set(yscale="log", xlabel=style.DELAY, ylabel=label, xlim=(delay[0] * 1e9, delay[-1] * 1e9))
 
 
-def mark_horizon(axes: Axes, horizon: float) -> None:
+def mark_horizon(axes: style.Axes, horizon: float, color: str = style.BLACK, zorder: float = 1) -> None:
     """Draw the edges of the wedge, ± `horizon` in s, as vertical dashed lines."""
     for sign in (-1, 1):
-        axes.axvline(sign * horizon * 1e9, color=style.BLACK, linestyle="--", linewidth=0.7, zorder=1)
+        axes.axvline(sign * horizon * 1e9, color=color, linestyle="--", linewidth=0.7, zorder=zorder)
 
 
-def name_baseline(axes: Axes, antennas: tuple[int, int], baseline_length: float) -> None:
+def name_baseline(axes: style.Axes, antennas: tuple[int, int], baseline_length: float) -> None:
     """Write the antenna numbers and the length in m of a baseline into the upper right corner."""
     a, b = antennas
     label = rf"({a}, {b}), $|\mathbf{{b}}| = {baseline_length:.1f}$ m"
@@ -96,23 +93,36 @@ def delay_edges(centres: np.ndarray) -> np.ndarray:
     return np.concatenate([[max(2 * centres[0] - middle[0], 0.0)], middle, [2 * centres[-1] - middle[-1]]])
 
 
-def cells(cylinder: Cylinder, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return edges in k_perp and k_parallel, and the values (Nb, Nd) on them with NaN where there are no baselines."""
+def draw_cells(axes: style.Axes, cylinder: Cylinder, values: np.ndarray, **look: Any) -> QuadMesh:
+    """Draw values (Nb, Nd) over k_perp and k_parallel, and grey where they are not known or there are no baselines."""
     lengths = np.unique(cylinder.bin_edges)
     # There are cells between bins of lengths that are not adjacent.
     grid = np.full((cylinder.delay.size, lengths.size - 1), np.nan)
     grid[:, np.searchsorted(lengths, cylinder.bin_edges[:, 0])] = values.T
-    return lengths * ratio(cylinder.k_perp, cylinder.baseline_length), delay_edges(cylinder.k_parallel), grid
+    axes.set_facecolor("0.8")
+    k_perp = lengths * ratio(cylinder.k_perp, cylinder.baseline_length)
+    cells = np.ma.masked_invalid(grid)
+    return axes.pcolormesh(k_perp, delay_edges(cylinder.k_parallel), cells, rasterized=True, **look)
 
 
-def draw_horizon(axes: Axes, cylinder: Cylinder, buffer: float, colour: str = "black") -> None:
+def draw_horizon(axes: style.Axes, cylinder: Cylinder, buffer: float, colour: str = "black") -> None:
     """Draw the horizon and, dashed, the delay `buffer` (s) beyond it, on axes of k_perp and k_parallel in h/Mpc."""
     lengths = cylinder.bin_edges[[0, -1], [0, 1]]
     k_perp = lengths * ratio(cylinder.k_perp, cylinder.baseline_length)
     per_second = ratio(cylinder.k_parallel, cylinder.delay)
-    for extra, line, label in ((0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")):
+    for extra, line, label in horizon_lines(buffer):
         edge = (horizon_delay(lengths) + extra) * per_second
         axes.plot(k_perp, edge, line, color=colour, linewidth=0.8, label=label)
+
+
+def horizon_lines(buffer: float) -> tuple[tuple[float, str, str], ...]:
+    """Return delays beyond the horizon, s, with their lines and labels."""
+    return (0.0, "-", "horizon"), (buffer, "--", f"horizon + {buffer * 1e9:.0f} ns")
+
+
+def name_horizon(axes: style.Axes) -> None:
+    """Add the legend of `draw_horizon`."""
+    axes.legend(loc="upper right", frameon=True, framealpha=0.9, edgecolor="none", fontsize=style.NOTE_SIZE)
 
 
 def ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
@@ -120,19 +130,12 @@ def ratio(numerator: np.ndarray, denominator: np.ndarray) -> float:
     return float(numerator[-1] / denominator[-1])
 
 
-def _scaled_by(factor: float) -> tuple[Callable[[ArrayLike], np.ndarray], Callable[[ArrayLike], np.ndarray]]:
+def _scaled_by(factor: float) -> tuple[partial, partial]:
     """Return the transform to an axis that is `factor` times another, and its inverse."""
-
-    def forward(values: ArrayLike) -> np.ndarray:
-        return np.asarray(values) * factor
-
-    def inverse(values: ArrayLike) -> np.ndarray:
-        return np.asarray(values) / factor
-
-    return forward, inverse
+    return partial(np.multiply, factor), partial(np.multiply, 1 / factor)
 
 
-def label_axes(axes: Axes, cylinder: Cylinder) -> None:
+def label_axes(axes: style.Axes, cylinder: Cylinder) -> None:
     """Set limits, with delays up to `MAX_DELAY`, and label k_perp (h/Mpc) below and metres above."""
     from matplotlib.ticker import MaxNLocator
 
@@ -148,9 +151,8 @@ def label_axes(axes: Axes, cylinder: Cylinder) -> None:
     lengths.xaxis.set_major_locator(MaxNLocator(nbins=3))
 
 
-def delay_axis(axes: Axes, cylinder: Cylinder) -> None:
+def delay_axis(axes: style.Axes, cylinder: Cylinder) -> None:
     """Add an axis of delays in ns on the right."""
-    to_wavenumber, to_delay = _scaled_by(ratio(cylinder.k_parallel, cylinder.delay) * 1e-9)
-    delays = axes.secondary_yaxis("right", functions=(to_delay, to_wavenumber))
+    delays = axes.secondary_yaxis("right", functions=_scaled_by(1e9 * ratio(cylinder.delay, cylinder.k_parallel)))
     delays.set_ylabel(style.DELAY)
     delays.tick_params(direction="out")

@@ -14,13 +14,15 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SIGMAS_95
 from calstudy.base.files import replacing
 
 if TYPE_CHECKING:
+    # Modules that draw name these types as `style.Axes` and `style.Figure`.
+    from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-    from matplotlib.text import Text
 
 
 ONE_COLUMN = 3.5
@@ -39,7 +41,7 @@ MAGENTA = "#CC79A7"
 GREY = "#6E6E6E"
 BAND = "#C9C9C9"
 
-SERIES = (("o", BLUE), ("s", ORANGE), ("D", GREEN), ("^", MAGENTA), ("v", RED))
+SERIES = (("o", BLUE), ("s", ORANGE), ("D", GREEN), ("^", MAGENTA), ("v", RED), ("P", CYAN), ("X", BLACK))
 """Marker and colour of several series of points."""
 OPEN_MARKER: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "color": GREY, "markersize": 4}
 """The entry of a legend for negative points, which are drawn open."""
@@ -92,11 +94,7 @@ _LOCK = RLock()
 
 @contextmanager
 def journal_style() -> Iterator[None]:
-    """Draw or save with the settings of this module, regardless of the user's; also a decorator.
-
-    Matplotlib's settings are global to the process: they are restored on exit, and a lock keeps two threads of a study
-    from drawing at once.
-    """
+    """Draw or save with the settings of this module, not the user's, one thread after the other; also a decorator."""
     import matplotlib.style
 
     with _LOCK, matplotlib.style.context(["default", _PARAMETERS]):
@@ -123,6 +121,16 @@ def label_one_two_five(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def band_name(low: float, high: float) -> str:
+    """Return a band of k, h/Mpc, as a title or label."""
+    return rf"$k = {low:g}$–${high:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$"
+
+
+def error_bars(axes: Axes, x: np.ndarray, values: np.ndarray, error: np.ndarray, **look: Any) -> None:
+    """Draw values with bars of 95 %, from standard deviations; a value whose error is not known has no bar."""
+    axes.errorbar(x, values, yerr=SIGMAS_95 * np.nan_to_num(error), **{"elinewidth": 0.7, **look})
+
+
 def entry(**look: Any) -> Line2D:
     """Return a line that is drawn in a legend alone."""
     from matplotlib.lines import Line2D
@@ -130,18 +138,14 @@ def entry(**look: Any) -> Line2D:
     return Line2D([], [], **look)
 
 
-def note_stand_ins(figure: Figure, stand_ins: Sequence[str]) -> Text | None:
-    """Print the substitutes for the paper's inputs as one small grey line below the axes, and return the text.
-
-    Each is a sentence or phrase, such as ``"synthetic faint sources"``. Without any, nothing is printed, and None is
-    returned.
-    """
+def note_stand_ins(figure: Figure, stand_ins: Sequence[str]) -> None:
+    """Print what stands in for the paper's inputs, sentences or phrases, in small grey letters below the axes."""
     if not stand_ins:
-        return None
+        return
     text = "stand-in: " + "; ".join(item.strip().rstrip(".") for item in stand_ins)
     # About 28 characters of this font and size are one inch wide.
     lines = textwrap.fill(text, width=int(28 * figure.get_figwidth()))
-    return figure.supxlabel(lines, x=0.01, ha="left", fontsize=NOTE_SIZE, color=GREY)
+    figure.supxlabel(lines, x=0.01, ha="left", fontsize=NOTE_SIZE, color=GREY)
 
 
 DOTS_PER_INCH = 200
@@ -150,33 +154,25 @@ RASTER_DOTS_PER_INCH = 600
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
-def figure_arrays(data: Any) -> dict[str, np.ndarray]:
+def figure_arrays(data: Any, path: str = "") -> dict[str, np.ndarray]:
     """Return every array of nested dataclasses, mappings and sequences by its path, ``"excised.residual.power"``.
 
-    None means absent; raises ValueError for other values than arrays, numbers and strings. A field of a dataclass may
-    have another name there, under ``array`` in its metadata, so that published arrays keep their names.
+    `path` is that of the data themselves. None means absent; raises ValueError for other values than arrays, numbers
+    and strings. A field of a dataclass may have another name there, under ``array`` in its metadata.
     """
-    arrays: dict[str, np.ndarray] = {}
-    _collect("", data, arrays)
-    return arrays
-
-
-def _collect(path: str, value: Any, arrays: dict[str, np.ndarray]) -> None:
-    prefix = f"{path}." if path else ""
-    if value is None:
-        return
-    if dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            name = field.metadata.get("array", field.name)
-            _collect(prefix + name, getattr(value, field.name), arrays)
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            _collect(f"{prefix}{key}", item, arrays)
-    elif isinstance(value, list | tuple) and any(not np.isscalar(item) for item in value):
-        for index, item in enumerate(value):
-            _collect(f"{prefix}{index}", item, arrays)
+    if data is None:
+        return {}
+    if dataclasses.is_dataclass(data):
+        fields = dataclasses.fields(data)
+        items: Any = [(field.metadata.get("array", field.name), getattr(data, field.name)) for field in fields]
+    elif isinstance(data, Mapping):
+        items = data.items()
+    elif isinstance(data, list | tuple) and not all(map(np.isscalar, data)):
+        items = enumerate(data)
     else:
-        arrays[path] = _plain_array(path, value)
+        return {path: _plain_array(path, data)}
+    prefix = f"{path}." if path else ""
+    return {key: array for name, item in items for key, array in figure_arrays(item, f"{prefix}{name}").items()}
 
 
 def _plain_array(name: str, value: Any) -> np.ndarray:
@@ -189,9 +185,8 @@ def _plain_array(name: str, value: Any) -> np.ndarray:
 def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Path | str, name: str) -> list[Path]:
     """Write ``name.npz``, ``name.pdf`` and ``name.png`` (200 dpi) into `directory`, and return the three paths.
 
-    Each file is written completely or not at all, and replaces an older one. The same figure and arrays give the same
-    bytes: no dates are written. Raises ValueError if the name has other characters than letters, digits, ``.``, ``_``
-    and ``-``, or an array (`figure_arrays`) is not plain, and OSError if the directory cannot be made or written.
+    Each file is written completely or not at all. The same figure and arrays give the same bytes, without dates.
+    Raises ValueError if the name is no file name or an array not plain, and OSError if it cannot be written.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"figure name '{name}' is not a file name: use letters, digits, '.', '_' and '-'")
@@ -204,23 +199,12 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
         "png": partial(figure.savefig, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}),
     }
     paths = [folder / f"{name}.{ending}" for ending in writers]
-    with journal_style(), _laid_out(figure):
+    with journal_style():
+        if figure.axes and (layout := figure.get_layout_engine()) is not None:
+            # Matplotlib would lay it out again for each file.
+            layout.execute(figure)
+            figure.set_layout_engine(None)
         for path, write in zip(paths, writers.values(), strict=True):
             with replacing(path) as stream:
                 write(stream)
     return paths
-
-
-@contextmanager
-def _laid_out(figure: Figure) -> Iterator[None]:
-    """Lay out a figure once; matplotlib would draw it an additional time for each file."""
-    layout = figure.get_layout_engine()
-    if layout is None or not figure.axes:
-        yield
-        return
-    layout.execute(figure)
-    figure.set_layout_engine(None)
-    try:
-        yield
-    finally:
-        figure.set_layout_engine(layout)

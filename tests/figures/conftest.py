@@ -15,7 +15,6 @@ from calstudy.figures.runtime import draw_runtime, summarize_runtime
 from calstudy.figures.spherical import SphericalColumn, draw_spherical
 from calstudy.figures.visibilities import (
     BaselineSpectra,
-    Visibilities,
     VisibilityComparison,
     compare_visibilities,
     draw_baselines,
@@ -117,8 +116,7 @@ def visibility_comparison() -> VisibilityComparison:
     rng = np.random.default_rng(12)
     foregrounds = 30 * np.exp(-2j * np.pi * FREQUENCY * 100e-9)
     noise = 0.02 * (rng.normal(size=64) + 1j * rng.normal(size=64))
-    visibilities = Visibilities(foregrounds + noise, foregrounds, noise)
-    return compare_visibilities((0, 1), 54.9, FREQUENCY, visibilities)
+    return compare_visibilities(((0, 1), 54.9), FREQUENCY, foregrounds + noise, foregrounds, noise)
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calstudy.figures.signal_loss import ExpectedLoss, SignalLoss, draw_expected_loss, draw_signal_loss
+from calstudy.figures.signal_loss import SignalLoss, draw_expected_loss, draw_signal_loss
 from calstudy.figures.sweep import SweepPanel, draw_sweep
 from calstudy.plotting.style import figure_arrays
 from calstudy.power.transfer import ExpectedBins, TransferFunction, TransferMap
@@ -123,7 +123,7 @@ def test_points_per_length_are_free_of_the_flux_scale_as_are_the_expected_lines(
         delay=found.delay,
         by_length=1.02**2 * found.transfer,
     )
-    right = draw_expected_loss(ExpectedLoss(expected, outside, found)).axes[1]
+    right = draw_expected_loss(expected, outside, found).axes[1]
     assert "free of the flux scale" in right.get_title()
     lines = [line for line in right.lines if str(line.get_label()).startswith("$")]
     for row, (line, container) in enumerate(zip(lines, right.containers, strict=True)):
