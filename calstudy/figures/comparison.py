@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import cycle
+from itertools import cycle, product
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from calstudy.base.constants import SIGMAS_95
 from calstudy.figures import MOST, CasesFigure
 from calstudy.plotting import style
 from calstudy.products.comparison import Case
@@ -17,17 +16,15 @@ from calstudy.run.task import Job
 from calstudy.verdicts.standing import SIGMAS, upper_limit
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
 
-COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA, style.RED, style.CYAN, style.BLACK)
-MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 LINEAR = {"recovered": 1.0, "bias": 0.1}
 """Upper end of the linear part of an axis; larger values make it logarithmic beyond."""
 REFERENCE = {"recovered": 1.0, "bias": 0.0}
 """Position of the line: all of the EoR, no bias."""
+SPECTRA = {"recovered": r"$P^R / P^S$", "bias": r"$s^2 P^{R_0} / P^S$"}
+"""What is drawn, from left to right."""
 DECADES = {"recovered": 1.5, "bias": 0.7}
 """Length of the linear part of a logarithmic axis, in decades."""
 ROW_HEIGHT, LARGEST_K = 1.7, 1.0
@@ -37,14 +34,10 @@ CROSS: dict[str, Any] = {"color": style.BLACK, "marker": "x", "markersize": 7, "
 
 def look(place: int) -> dict[str, Any]:
     """Return colour, marker and line of one of several calibrators or worlds."""
-    lines = ("-", "--", ":")
-    again, place = divmod(place, len(COLOURS))
-    return {
-        "color": COLOURS[place],
-        # A repeated colour has another marker.
-        "marker": MARKERS[(place + 3 * again) % len(MARKERS)],
-        "linestyle": lines[again % len(lines)],
-    }
+    again, place = divmod(place, len(style.SERIES))
+    # A repeated colour has another marker.
+    marker, _ = style.SERIES[(place + 3 * again) % len(style.SERIES)]
+    return {"color": style.SERIES[place][1], "marker": marker, "linestyle": ("-", "--", ":")[again % 3]}
 
 
 def is_unsettled(case: Case) -> bool:
@@ -54,32 +47,25 @@ def is_unsettled(case: Case) -> bool:
 
 def cross_entries(cases: Mapping[str, Mapping[str, Case]]) -> list[Line2D]:
     """Return the entry of crosses for a legend, or none if no case has a cross."""
-    if any(is_unsettled(case) for found in cases.values() for case in found.values()):
-        return [style.entry(label="most solves did not converge", **CROSS)]
-    return []
+    crossed = any(is_unsettled(case) for found in cases.values() for case in found.values())
+    return [style.entry(label="most solves did not converge", **CROSS)] if crossed else []
 
 
 @style.journal_style()
-def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
-    """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, outside the wedge, with 95 % bars.
-
-    `cases` are by world and calibrator.
-    """
+def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
+    """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, with 95 % bars, a row for each world."""
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
     grid = figure.subplots(len(cases), 2, squeeze=False, sharex=True)
-    for (left, right), (world, found) in zip(grid, cases.items(), strict=True):
-        for name, case in found.items():
-            place = calibrators.index(name)
-            shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
-            _draw_points(left, case, "recovered", place, shift)
-            _draw_points(right, case, "bias", place, shift)
-        _scale(left, "recovered", found.values())
-        _scale(right, "bias", found.values())
-        left.axhline(REFERENCE["recovered"], color=style.GREY, linewidth=0.7, zorder=0)
-        right.axhline(REFERENCE["bias"], color=style.GREY, linewidth=0.7, zorder=0)
-        left.set_title(world, loc="left")
-        left.set_ylabel(r"$P^R / P^S$")
-        right.set_ylabel(r"$s^2 P^{R_0} / P^S$")
+    for row, (world, found) in zip(grid, cases.items(), strict=True):
+        for axes, (score, label) in zip(row, SPECTRA.items(), strict=True):
+            for name, case in found.items():
+                place = calibrators.index(name)
+                shift = 0.15 * (place - (len(calibrators) - 1) / 2) / len(calibrators)
+                _draw_points(axes, case, score, place, shift)
+            _scale(axes, score, found.values())
+            axes.axhline(REFERENCE[score], color=style.GREY, linewidth=0.7, zorder=0)
+            axes.set_ylabel(label)
+        row[0].set_title(world, loc="left")
     for axes in grid[-1]:
         axes.set_xlabel(style.WAVENUMBER)
     handles = [style.entry(linewidth=0.6, markersize=2.5, **look(place)) for place in range(len(calibrators))]
@@ -87,20 +73,18 @@ def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[
     return figure
 
 
-def _draw_points(axes: Axes, case: Case, name: str, place: int, shift: float) -> None:
-    bins = case.bins
-    values, errors = getattr(bins, name), getattr(bins, f"{name}_error")
-    used = _used(case, name)
-    k = bins.k + shift * np.diff(bins.bin_edges)
-    bars = SIGMAS_95 * np.nan_to_num(errors[used])
-    axes.errorbar(k[used], values[used], yerr=bars, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
+def _draw_points(axes: style.Axes, case: Case, name: str, place: int, shift: float) -> None:
+    bins, used = case.bins, _used(case, name)
+    k = (bins.k + shift * np.diff(bins.bin_edges))[used]
+    values, errors = getattr(bins, name)[used], getattr(bins, f"{name}_error")[used]
+    style.error_bars(axes, k, values, errors, elinewidth=0.5, linewidth=0.6, markersize=2.5, **look(place))
 
 
 def _used(case: Case, name: str) -> np.ndarray:
     return np.isfinite(getattr(case.bins, name)) & (case.bins.k <= LARGEST_K)
 
 
-def _scale(axes: Axes, name: str, cases: Iterable[Case]) -> None:
+def _scale(axes: style.Axes, name: str, cases: Iterable[Case]) -> None:
     """Make an axis logarithmic where its values are large, with limits just beyond them, zero and the reference.
 
     Bars may reach beyond the limits: the largest ones would make the other points too small to read.
@@ -127,7 +111,7 @@ class ComparisonSpectra(CasesFigure):
     caption = "Recovered power (left) and bias (right) outside the wedge in units of the EoR, with 95 % bars."
     scores = "bins"
 
-    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> style.Figure:
         """Draw all cases."""
         return draw_spectra(cases, job.settings["calibrators"])
 
@@ -138,11 +122,8 @@ LABEL_WIDTH = 10
 
 
 @style.journal_style()
-def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
-    """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars.
-
-    The calibrators are values of one setting, in order. `cases` are by world and calibrator.
-    """
+def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
+    """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars."""
     worlds = list(cases)
     edges = next(case for found in cases.values() for case in found.values()).bands.bin_edges
     figure = style.new_figure(style.TWO_COLUMNS, 4.2)
@@ -152,10 +133,8 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
             at = np.array([calibrators.index(name) for name in found])
             at = at + 0.3 * (place - (len(worlds) - 1) / 2) / len(worlds)
             for axes, name in ((upper, "transfer"), (lower, "bias")):
-                values, errors = (_in_band(found, column, band) for column in (name, f"{name}_error"))
-                bars = SIGMAS_95 * np.nan_to_num(errors)
-                axes.errorbar(at, values, yerr=bars, elinewidth=0.6, linewidth=0.7, **look(place))
-        upper.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
+                draw_in_band(axes, at, list(found.values()), name, band, look(place))
+        upper.set_title(style.band_name(*edges[band : band + 2]))
         upper.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
         lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
         lower.set_yscale("symlog", linthresh=LINEAR_BIAS)
@@ -168,8 +147,14 @@ def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
     return figure
 
 
-def _in_band(found: Mapping[str, Case], name: str, band: int) -> np.ndarray:
-    return np.array([getattr(case.bands, name)[band] for case in found.values()])
+def draw_in_band(
+    axes: style.Axes, at: np.ndarray, cases: Sequence[Case], name: str, band: int, its: Mapping[str, Any]
+) -> np.ndarray:
+    """Draw a score of cases in a band of k with 95 % bars, and return its values."""
+    columns = (name, f"{name}_error")
+    values, errors = (np.array([getattr(case.bands, column)[band] for case in cases]) for column in columns)
+    style.error_bars(axes, at, values, errors, elinewidth=0.6, linewidth=0.7, **its)
+    return values
 
 
 class ComparisonCurves(CasesFigure):
@@ -180,7 +165,7 @@ class ComparisonCurves(CasesFigure):
     kind: str = "comparison-curves"
     caption = "Transfer function and bias outside the wedge from one calibrator to the next, with 95 % bars."
 
-    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> style.Figure:
         """Draw all cases."""
         return draw_curves(cases, job.settings["calibrators"])
 
@@ -210,17 +195,17 @@ def _names(groups: Mapping[str, Mapping[str, str]]) -> list[str]:
 
 
 @style.journal_style()
-def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
+def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
     """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
 
-    Colours are variants of calibrators, symbols those of worlds: the text after the last comma of a label names the
-    variant. Open symbols are 95 % upper limits of a bias that is within two standard deviations of zero; crosses
-    mark cases of which most solves did not converge. `cases` are by world and calibrator.
+    Colours are variants of calibrators, symbols those of worlds. Open symbols are 95 % upper limits of a bias that is
+    within two standard deviations of zero; crosses mark cases of which most solves did not converge.
     """
     worlds, rows = variants(list(cases)), variants(calibrators)
+    scored = {world: {name for label in kinds.values() for name in cases[label]} for world, kinds in worlds.items()}
     shown = {
-        world: [name for name, labels in rows.items() if _drawn(labels, [cases[label] for label in kinds.values()])]
-        for world, kinds in worlds.items()
+        world: [name for name, labels in rows.items() if not names.isdisjoint(labels.values())]
+        for world, names in scored.items()
     }
     heights = [HEADING_HEIGHT + VARIANT_HEIGHT * len(names) for names in shown.values()]
     figure = style.new_figure(style.TWO_COLUMNS, 0.8 + sum(heights))
@@ -235,31 +220,24 @@ def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence
             axes.set_title(world if band == 0 else "", loc="left")
             axes.set_yticks(range(len(shown[world])), shown[world] if band == 0 else [])
     for band, axes in enumerate(grid[-1]):
-        low, high = edges[band : band + 2]
-        axes.set_xlabel(rf"bias $s^2\,|P^{{R_0}}| / P^S$, $k = {low:g}$–${high:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$")
-    handles = [style.entry(color=colour, marker="o", linestyle="", label=name) for name, colour in colours.items()]
-    handles += [
-        style.entry(color=style.GREY, marker=marker, linestyle="", label=name) for name, marker in markers.items()
-    ]
-    handles += [
-        style.entry(color=style.GREY, marker="o", markerfacecolor="white", linestyle="", label="95 % upper limit"),
-        *cross_entries(cases),
-    ]
+        axes.set_xlabel(rf"bias $s^2\,|P^{{R_0}}| / P^S$, {style.band_name(*edges[band : band + 2])}")
+    looks = [{"color": colour, "marker": "o", "label": name} for name, colour in colours.items()]
+    looks += [{"color": style.GREY, "marker": marker, "label": name} for name, marker in markers.items()]
+    looks += [{"color": style.GREY, "marker": "o", "markerfacecolor": "white", "label": "95 % upper limit"}]
+    handles = [style.entry(linestyle="", **its) for its in looks] + cross_entries(cases)
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), columnspacing=1.0)
     return figure
 
 
-def _drawn(labels: Mapping[str, str], worlds: Sequence[Mapping[str, Case]]) -> bool:
-    return any(label in world for label in labels.values() for world in worlds)
-
-
-def is_limit(bias: float, error: float) -> bool:
-    """Whether the bias is within two standard deviations of zero, so that only its upper limit is known."""
-    return bool(np.isfinite(error) and abs(bias) < SIGMAS * error)
+def shown_bias(case: Case, band: int) -> tuple[float, bool]:
+    """Return the size of the bias, or its upper limit and True if it is within two standard deviations of zero."""
+    bias, error = float(case.bands.bias[band]), float(case.bands.bias_error[band])
+    limited = bool(np.isfinite(error) and abs(bias) < SIGMAS * error)
+    return upper_limit(bias, error) if limited else abs(bias), limited
 
 
 def _draw_panel(
-    axes: Axes,
+    axes: style.Axes,
     kinds: Mapping[str, Mapping[str, Case]],
     rows: Mapping[str, Mapping[str, str]],
     looks: tuple[Mapping[str, str], Mapping[str, str]],
@@ -269,22 +247,16 @@ def _draw_panel(
     colours, markers = looks
     count = len(colours) * len(kinds)
     for row, labels in enumerate(rows.values()):
-        for place, (variant, label) in enumerate(labels.items()):
-            for number, (kind, cases) in enumerate(kinds.items()):
-                if label not in cases:
-                    continue
-                bands = cases[label].bands
-                bias, error = float(bands.bias[band]), float(bands.bias_error[band])
-                limited = is_limit(bias, error)
-                at = (
-                    upper_limit(bias, error) if limited else abs(bias),
-                    row + SPREAD * ((place * len(kinds) + number + 0.5) / count - 0.5),
-                )
-                face = "white" if limited else colours[variant]
-                axes.plot(*at, marker=markers[kind], linestyle="", color=colours[variant], markerfacecolor=face)
-                if is_unsettled(cases[label]):
-                    # Below the symbols, so that open ones stay open.
-                    axes.plot(*at, **{**CROSS, "zorder": 1})
+        for place, ((variant, label), (kind, cases)) in enumerate(product(labels.items(), kinds.items())):
+            if label not in cases:
+                continue
+            shown, limited = shown_bias(cases[label], band)
+            at = shown, row + SPREAD * ((place + 0.5) / count - 0.5)
+            face = "white" if limited else colours[variant]
+            axes.plot(*at, marker=markers[kind], linestyle="", color=colours[variant], markerfacecolor=face)
+            if is_unsettled(cases[label]):
+                # Below the symbols, so that open ones stay open.
+                axes.plot(*at, **{**CROSS, "zorder": 1})
     axes.set_xscale("log")
     smallest = min((value for line in axes.lines for value in np.atleast_1d(line.get_xdata()) if value > 0), default=1)
     axes.set_xlim(left=min(LOWEST, smallest / 2))
@@ -307,6 +279,6 @@ class ComparisonVariants(CasesFigure):
         "most solves did not converge."
     )
 
-    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> style.Figure:
         """Draw all cases."""
         return draw_variants(cases, job.settings["calibrators"])

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.table import number
 from calstudy.figures import CasesFigure
-from calstudy.figures.comparison import CROSS, cross_entries, is_limit, is_unsettled, look
+from calstudy.figures.comparison import CROSS, cross_entries, draw_in_band, is_unsettled, look, shown_bias
 from calstudy.plotting import style
 from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.comparison import Case
 from calstudy.products.tolerances import Fault, faults
 from calstudy.run.task import Job
-from calstudy.verdicts.standing import LIMIT, is_measured, upper_limit
+from calstudy.verdicts.standing import LIMIT, is_measured
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
-    from matplotlib.figure import Figure
 
 
 LIMITS, COLOURS = (1e-2, 1e2), "YlOrRd"
@@ -44,12 +41,11 @@ MAX_COLUMNS = 11
 
 
 @style.journal_style()
-def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> Figure:
+def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
     """Draw a matrix for each band of k: worlds from left to right, or from top to bottom where they are many.
 
-    The colour is the bias. For a bias within two standard deviations of zero, the 95 % upper limit is written and
-    coloured, and the cell is hatched; a T that is not measured is not written. A star marks a case of which most solves
-    did not converge. `cases` are by world and calibrator; a case without scores is left white and labelled.
+    The colour is the bias, or for one within two standard deviations of zero the 95 % upper limit, and the cell is
+    hatched. A star marks a case of which most solves did not converge; one without scores is left white.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
@@ -70,7 +66,7 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
     for band, axes in enumerate(panels.flat):
         _draw_band(axes, cells, band, shades, across * len(columns))
         axes.set_yticks(range(len(rows)), rows)
-        axes.set_title(rf"$k = {edges[band]:g}$–${edges[band + 1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$", loc="left")
+        axes.set_title(style.band_name(*edges[band : band + 2]), loc="left")
     for axes in panels[-1]:
         _name_columns(axes, columns, LABELS_WIDTH // (across * len(columns)))
     bar = figure.colorbar(shades, ax=panels, extend="both", aspect=40, pad=0.01)
@@ -80,11 +76,11 @@ def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[s
 
 
 def _stars(case: Case | None) -> str:
-    """Return a star for a case of which most solves did not converge, else an empty text."""
+    """Return a star if most solves of a case did not converge."""
     return "*" if case is not None and is_unsettled(case) else ""
 
 
-def _name_columns(axes: Axes, labels: Sequence[str], width: int) -> None:
+def _name_columns(axes: style.Axes, labels: Sequence[str], width: int) -> None:
     """Write the labels of the columns, in lines of so many characters or, if words are longer, slanted."""
     if max(len(word) for label in labels for word in label.split()) <= width:
         axes.set_xticks(range(len(labels)), [textwrap.fill(label, width) for label in labels])
@@ -93,41 +89,27 @@ def _name_columns(axes: Axes, labels: Sequence[str], width: int) -> None:
 
 
 def _draw_band(
-    axes: Axes, cells: Sequence[Sequence[Case | None]], band: int, shades: ScalarMappable, n_columns: int
+    axes: style.Axes, cells: Sequence[Sequence[Case | None]], band: int, shades: ScalarMappable, n_columns: int
 ) -> None:
     from matplotlib.patches import Rectangle
 
     colours = np.full((len(cells), len(cells[0]), 4), 1.0)
+    centred: dict[str, Any] = {"ha": "center", "va": "center", "size": style.SMALL_SIZE}
     for (row, column), case in np.ndenumerate(np.array(cells, dtype=object)):
         if case is None:
-            axes.text(column, row, "no scores", ha="center", va="center", size=style.SMALL_SIZE, color=style.GREY)
+            axes.text(column, row, "no scores", color=style.GREY, **centred)
             continue
-        bands = case.bands
-        shown, bias = _bias(bands.bias[band], bands.bias_error[band])
+        shown, limited = shown_bias(case, band)
         if np.isfinite(shown):
             colours[row, column] = shades.to_rgba(np.asarray(shown))
-        if is_limit(bands.bias[band], bands.bias_error[band]):
+        if limited:
             axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, hatch="////", ec=FAINT, lw=0))
-        axes.text(
-            column,
-            row,
-            f"{bias}{_stars(case)}\n{_transfer(bands.transfer[band], bands.transfer_error[band], n_columns)}",
-            ha="center",
-            va="center",
-            fontsize=style.SMALL_SIZE,
-            color="white" if shown > DARK else style.BLACK,
-            linespacing=1.1,
-        )
+        bias = f"bias < {_digits(shown)}" if limited else f"bias {_digits(case.bands.bias[band])}"
+        transfer = _transfer(case.bands.transfer[band], case.bands.transfer_error[band], n_columns)
+        colour = "white" if shown > DARK else style.BLACK
+        axes.text(column, row, f"{bias}{_stars(case)}\n{transfer}", color=colour, linespacing=1.1, **centred)
     axes.imshow(colours, aspect="auto")
     axes.tick_params(length=0)
-
-
-def _bias(bias: float, error: float) -> tuple[float, str]:
-    """Return the size that is coloured, the bias or its upper limit, and the text."""
-    if is_limit(bias, error):
-        limit = upper_limit(bias, error)
-        return limit, f"bias < {_digits(limit)}"
-    return abs(bias), f"bias {_digits(bias)}"
 
 
 def _transfer(value: float, error: float, n_columns: int) -> str:
@@ -157,7 +139,7 @@ class ComparisonMatrix(CasesFigure):
         "T of the EoR that is left, if it was measured. Where most solves did not converge, a star says so."
     )
 
-    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> style.Figure:
         """Draw all cases."""
         return draw_matrix(cases, job.settings["calibrators"])
 
@@ -175,19 +157,19 @@ def draw_tolerances(
     cases: Mapping[str, Mapping[str, Case]],
     calibrators: Sequence[str],
     eor_level: float | None = None,
-) -> Figure:
-    """Draw the bias on the left and T on the right against the severity of each fault, with 95 % bars.
+) -> style.Figure:
+    """Draw bias (left) and T (right) in the band of the headline against the severity of each fault, with 95 % bars.
 
-    Both are in the band of k in which tolerances are judged. The dashed line is the bias that is tolerated. Crosses are
-    over cases of which most solves did not converge. `cases` are by world and calibrator. The level of the EoR, dB of
-    amplitude over the foregrounds, is None if cases differ in it, or it is not known.
+    The dashed line is the bias that is tolerated; crosses are over cases of which most solves did not converge. The
+    level of the EoR, dB of amplitude over the foregrounds, is None if cases differ in it, or it is not known.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + FAULT_HEIGHT * len(found))
     grid = figure.subplots(len(found), 2, squeeze=False)
     for (left, right), fault in zip(grid, found, strict=True):
         for place, calibrator in enumerate(calibrators):
-            _draw_points(left, fault, cases, calibrator, "bias", place)
-            _draw_points(right, fault, cases, calibrator, "transfer", place)
+            scored = [cases[world].get(calibrator) for world in fault.worlds]
+            _draw_points(left, fault, scored, "bias", place)
+            _draw_points(right, fault, scored, "transfer", place)
         left.set_yscale("symlog", linthresh=LINEAR)
         left.axhline(LIMIT, color=style.GREY, linewidth=0.7, linestyle="--", zorder=0)
         right.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
@@ -199,13 +181,11 @@ def draw_tolerances(
             positions = _positions(fault)
             axes.set_xticks(positions, [f"{severity:g}" for severity in fault.severities])
             axes.set_xticks([], minor=True)
-    band = rf"$k = {HEADLINE_BAND[0]:g}$–${HEADLINE_BAND[1]:g}$ $h\,\mathrm{{Mpc}}^{{-1}}$"
     level = "" if eor_level is None else rf", EoR at ${eor_level:g}$ dB of the foregrounds"
-    grid[0, 0].set_title(band + level, loc="left")
-    scored = {name for found in cases.values() for name in found}
-    looks = {name: look(place) for place, name in enumerate(calibrators) if name in scored}
-    handles = [style.entry(label=name, linewidth=0.7, **its) for name, its in looks.items()]
-    handles += cross_entries(cases)
+    grid[0, 0].set_title(style.band_name(*HEADLINE_BAND) + level, loc="left")
+    drawn = {name for found in cases.values() for name in found}
+    looks = [{"label": name, **look(place)} for place, name in enumerate(calibrators) if name in drawn]
+    handles = [style.entry(linewidth=0.7, **its) for its in looks] + cross_entries(cases)
     figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5))
     return figure
 
@@ -215,19 +195,13 @@ def _positions(fault: Fault) -> np.ndarray:
     return np.where(severities > 0, severities, ZERO * severities[severities > 0].min())
 
 
-def _draw_points(
-    axes: Axes, fault: Fault, cases: Mapping[str, Mapping[str, Case]], calibrator: str, name: str, place: int
-) -> None:
-    there = [calibrator in cases[world] for world in fault.worlds]
-    found = [cases[world][calibrator] for world in fault.worlds if calibrator in cases[world]]
+def _draw_points(axes: style.Axes, fault: Fault, cases: Sequence[Case | None], name: str, place: int) -> None:
+    found = [case for case in cases if case is not None]
     if not found:
         return
-    bands = [case.bands for case in found]
-    band = int(np.argmin(np.abs(bands[0].bin_edges[:-1] - HEADLINE_BAND[0])))
-    values, errors = (np.array([getattr(item, column)[band] for item in bands]) for column in (name, f"{name}_error"))
-    positions = _positions(fault)[there]
-    bars = SIGMAS_95 * np.nan_to_num(errors)
-    axes.errorbar(positions, values, yerr=bars, elinewidth=0.6, linewidth=0.7, **look(place))
+    band = int(np.argmin(np.abs(found[0].bands.bin_edges[:-1] - HEADLINE_BAND[0])))
+    positions = _positions(fault)[[case is not None for case in cases]]
+    values = draw_in_band(axes, positions, found, name, band, look(place))
     lost = [is_unsettled(case) for case in found]
     axes.plot(positions[lost], values[lost], **CROSS)
 
@@ -244,7 +218,7 @@ class ComparisonTolerances(CasesFigure):
     )
     sections = ("corruption.eor_level",)
 
-    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
+    def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> style.Figure:
         """Draw a row for each fault; raises InputError if the worlds name none."""
         found = faults(job.settings["worlds"])
         if not found:
