@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from itertools import product
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,11 +23,6 @@ from calstudy.products.graph import Graph
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, half
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
 BIAS = r"$|P^{R}|\,/\,P^{S}$, no EoR in the data"
 LOWEST = 1e-3
 TOTAL = r"$P^{R}/P^{S}$, EoR in the data"
@@ -37,9 +32,8 @@ TOTAL = r"$P^{R}/P^{S}$, EoR in the data"
 class ConvergencePath:
     """Power common to even and odd residuals after a number of steps of a solver, over the power of the EoR.
 
-    All arrays are (Ncheckpoints,), `steps` ascending. `bias` is without EoR in the data, and `with_eor` with it, each
-    with its standard deviation; `predicted` is the power that corresponds to the solver's own distance from the
-    minimum.
+    `bias` is without EoR in the data, `with_eor` with it; `predicted` is the power that corresponds to the solver's own
+    distance from the minimum, (Ncheckpoints,).
     """
 
     solver: str
@@ -52,58 +46,46 @@ class ConvergencePath:
 
 
 @style.journal_style()
-def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[int]) -> Figure:
-    """Draw the bias without EoR on the left, and with EoR on the right, against steps, of one to five solvers.
+def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[int]) -> style.Figure:
+    """Draw the bias without EoR on the left, and with EoR on the right, against the steps of solvers.
 
-    Bars are 95 % (1.96 sigma, leaving out one antenna after the other); open markers are negative. Dashes are the
-    predictions of the solver from where it stopped. The title names the solved integrations.
+    Bars are 95 % by leaving out antennas; open markers are negative; dashes are what the solver predicts.
     """
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import StrMethodFormatter
 
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)
     left, right = figure.subplots(1, 2)
     for path, (marker, colour) in zip(paths, style.SERIES, strict=False):
-        _draw_path(left, path, (path.bias, path.bias_error), marker, colour)
+        look = {"fmt": marker, "color": colour, "elinewidth": 0.7}
+        _draw_path(left, path, path.bias, path.bias_error, look)
         left.plot(path.steps, np.where(path.predicted > 0, path.predicted, np.nan), color=colour, linestyle="--")
-        _draw_path(right, path, (path.with_eor, path.with_eor_error), marker, colour)
+        _draw_path(right, path, path.with_eor, path.with_eor_error, look)
     left.plot([], [], color=style.GREY, linestyle="--", label="predicted where it stopped")
     for axes, label in ((left, BIAS), (right, TOTAL)):
         axes.axhline(1.0, color=style.GREY, linewidth=0.7, zorder=0)
         axes.set(xscale="log", yscale="log", xlabel="step", ylabel=label)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     left.set_ylim(bottom=max(LOWEST, left.get_ylim()[0]))
     left.legend(loc="lower right")
     right.legend(loc="upper right")
-    count = len(integrations)
-    figure.suptitle(
-        f"even x odd outside the wedge, {count} integration{'s' if count > 1 else ''}, each solved from unity gains",
-        fontsize=8.5,
-    )
+    solved = f"{len(integrations)} integration{'s' if len(integrations) > 1 else ''}"
+    figure.suptitle(f"even x odd outside the wedge, {solved}, each solved from unity gains", fontsize=8.5)
     return figure
 
 
 def _draw_path(
-    axes: Axes, path: ConvergencePath, measured: tuple[np.ndarray, np.ndarray], marker: str, colour: str
+    axes: style.Axes, path: ConvergencePath, power: np.ndarray, error: np.ndarray, look: dict[str, Any]
 ) -> None:
-    power, error = measured
-    size = np.abs(power)
-    axes.plot(path.steps, size, color=colour, linewidth=0.8)
+    size, reach = np.abs(power), SIGMAS_95 * error
+    axes.plot(path.steps, size, color=look["color"], linewidth=0.8)
     # Bars that reach below zero have no lower end on this scale.
-    reach = SIGMAS_95 * error
-    lower = np.minimum(reach, 0.999 * size)
-    for positive in (True, False):
-        chosen = (power > 0) == positive
-        axes.errorbar(
-            path.steps[chosen],
-            size[chosen],
-            [lower[chosen], reach[chosen]],
-            fmt=marker,
-            color=colour,
-            markerfacecolor=colour if positive else "white",
-            elinewidth=0.7,
-            label=path.solver if positive else None,
-        )
+    bars = np.array([np.minimum(reach, 0.999 * size), reach])
+    for chosen, its in (
+        (power > 0, {"markerfacecolor": look["color"], "label": path.solver}),
+        (~(power > 0), {"markerfacecolor": "white"}),
+    ):
+        axes.errorbar(path.steps[chosen], size[chosen], bars[:, chosen], **look, **its)
 
 
 COLUMNS = ("solver", "steps", "bias", "bias error", "with EoR", "with EoR error", "predicted")
@@ -117,7 +99,6 @@ class Convergence(StudyFigure):
     kind: str = "convergence"
 
     caption = "What solvers leave of the foregrounds in even and odd alike, against their steps, over the EoR."
-    variants = SIGNAL_LOSS_VARIANTS
     needs_signal_loss = True
     needs_least_squares = True
     needs_calibration = True
@@ -137,13 +118,11 @@ class Convergence(StudyFigure):
 
     def inputs(self, graph: Graph) -> Mapping[str, Task]:
         """Return every solver on every integration of data with the EoR and without."""
-        solvers = graph.experiment.outputs.convergence.solvers
-        names = dict(zip(("with", "without"), SIGNAL_LOSS_VARIANTS, strict=False))
+        solvers = graph.experiment.outputs.convergence.solvers.items()
+        kinds = tuple(zip(("with", "without"), SIGNAL_LOSS_VARIANTS, strict=False))
         return {
-            f"{label} {kind} {integration}": followed(graph, names[kind], solver, integration)
-            for (label, solver), kind, integration in itertools.product(
-                solvers.items(), names, self._integrations(graph)
-            )
+            f"{label} {kind} {integration}": followed(graph, variant, solver, integration)
+            for (label, solver), (kind, variant), integration in product(solvers, kinds, self._integrations(graph))
         }
 
     def settings(self, graph: Graph) -> Mapping[str, Any]:
@@ -156,8 +135,8 @@ class Convergence(StudyFigure):
         paths = [_path(job, label) for label in job.settings["solvers"]]
         rows: list[list[Any]] = []
         for path in paths:
-            columns = (path.steps, path.bias, path.bias_error, path.with_eor, path.with_eor_error, path.predicted)
-            rows += [[path.solver, *row] for row in zip(*(part.tolist() for part in columns), strict=True)]
+            solver, *columns = vars(path).values()
+            rows += [[solver, *row] for row in zip(*(column.tolist() for column in columns), strict=True)]
         Table(COLUMNS, rows).write_csv(job.output / "convergence.csv")
         figure = draw_convergence(paths, job.settings["integrations"])
         notes = {path.solver: {"steps": int(path.steps[-1]), "bias": round(float(path.bias[-1]), 4)} for path in paths}
@@ -171,21 +150,14 @@ def _path(job: Job, label: str) -> ConvergencePath:
         for variant in ("without", "with")
     }
     # Integrations that end early keep their last value.
-    longest = {name: max(items, key=lambda item: len(item["checkpoints"])) for name, items in found.items()}
-    count = max(len(item["checkpoints"]) for item in longest.values())
-    steps = max(longest.values(), key=lambda item: len(item["checkpoints"]))["checkpoints"]
-    ratios = {name: [_ratio(items, row) for row in range(count)] for name, items in found.items()}
-    predicted = [np.mean([_predicted(item, row) for item in found["without"]]) for row in range(count)]
-    columns = {name: np.array(values).T for name, values in ratios.items()}
-    return ConvergencePath(
-        solver=label,
-        steps=np.array([max(row["steps"]) for row in steps]),
-        bias=columns["without"][0],
-        bias_error=columns["without"][1],
-        with_eor=columns["with"][0],
-        with_eor_error=columns["with"][1],
-        predicted=np.array(predicted),
+    longest = max((item["checkpoints"] for items in found.values() for item in items), key=len)
+    rows = range(len(longest))
+    (bias, bias_error), (with_eor, with_eor_error) = (
+        np.array([_ratio(items, row) for row in rows]).T for items in found.values()
     )
+    predicted = np.array([np.mean([_predicted(item, row) for item in found["without"]]) for row in rows])
+    steps = np.array([max(row["steps"]) for row in longest])
+    return ConvergencePath(label, steps, bias, bias_error, with_eor, with_eor_error, predicted)
 
 
 def _checkpoint(item: Mapping[str, Any], row: int) -> Mapping[str, Any]:
@@ -194,9 +166,8 @@ def _checkpoint(item: Mapping[str, Any], row: int) -> Mapping[str, Any]:
 
 def _ratio(items: Sequence[Mapping[str, Any]], row: int) -> tuple[float, float]:
     power = np.sum([_checkpoint(item, row)["power"] for item in items], axis=0)
-    return ratio_over_antennas(
-        power, np.sum([item["signal"] for item in items], axis=0), np.array(items[0]["antennas"])
-    )
+    signal = np.sum([item["signal"] for item in items], axis=0)
+    return ratio_over_antennas(power, signal, np.array(items[0]["antennas"]))
 
 
 def _predicted(item: Mapping[str, Any], row: int) -> float:

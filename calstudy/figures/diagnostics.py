@@ -14,7 +14,7 @@ from calstudy.base.visibilities import antenna_pairs, baseline_vectors, flag_cub
 from calstudy.calibrate.basis import ChannelGrid, channel_grid
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
-from calstudy.plotting.axes import TAPER
+from calstudy.plotting.axes import TAPER, mark_horizon
 from calstudy.power.delay import horizon_delay, make_taper
 from calstudy.products.calibration import read_result
 from calstudy.products.files import DATA, GAINS, read_visibilities
@@ -23,13 +23,12 @@ from calstudy.products.observed import calibrated, observed
 from calstudy.run.task import Job, Task
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from pyuvdata import UVData
 
     from calstudy.calibrate.records import CalibrationResult
     from calstudy.products.graph import MeasuredGraph
 
+COLOURS = {"data": style.BLACK, "model": style.BLUE, "residual": style.ORANGE}
 MAX_NAMES = 20
 LINEAR_RANGE = 5.0
 SHORT_AXIS = 100.0
@@ -40,22 +39,12 @@ MAX_ANTENNAS = 8
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """The arrays of the figure, for one polarization.
+    """The arrays of the figure, for one polarization; units are SI, delays and `lengths` ascending.
 
-    Attributes
-    ----------
-    delay : s, ascending, (Ndelays,)
-    lengths : baseline lengths in m, ascending, (Nbls,)
-    data, model, residual
-        Delay transform after a Blackman-Harris taper, rms over integrations, (Nbls, Ndelays); flagged samples are zero.
-    frequency : Hz, (Nfreqs,)
-    antennas : names of the antennas that are drawn, (Nshown,)
-    gains : complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs)
-    errors : of |g| and, in rad, of the phase, by noise; NaN where they are not known, (2, Nshown, Nfreqs)
-    losses : loss after each step over the first loss of its own solve, one array for each solve
-    converged : true for each solve that converged, (Nsolves,)
-    chi2_antennas : names of all calibrated antennas, (Nants,)
-    chi2_by_antenna, chi2_by_channel, chi2_by_integration : as in `calstudy.realdata.quality.Quality`
+    `data`, `model` and `residual` are delay transforms after a Blackman-Harris taper, rms over integrations, (Nbls,
+    Ndelays). `gains` are those of `antennas` in the middle integration, NaN where flagged, (Nshown, Nfreqs), and
+    `errors` those of |g| and of the phase, NaN where not known, (2, Nshown, Nfreqs). `losses` are over the first of
+    each solve. The last four are those of `calstudy.realdata.quality.Quality`.
     """
 
     polarization: str
@@ -90,11 +79,10 @@ def _delay_rms(cube: np.ndarray, grid: ChannelGrid) -> np.ndarray:
 
 
 @style.journal_style()
-def draw_diagnostics(found: Diagnostics) -> Figure:
+def draw_diagnostics(found: Diagnostics) -> style.Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
-    The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
-    samples count as zero, which spreads over all delays. Bands are the errors of gains by noise.
+    Images are decibel of amplitude relative to the peak of the data, in which flagged samples count as zero.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 8.4)
     grid = figure.subplot_mosaic([list("dddmmmrrr"), list("pppppllll"), list("aaaaaffff"), list("xxxyyyzzz")])
@@ -120,54 +108,44 @@ def draw_diagnostics(found: Diagnostics) -> Figure:
     return figure
 
 
-def _draw_images(figure: Figure, panels: list[Axes], found: Diagnostics) -> None:
+def _draw_images(figure: style.Figure, panels: list[style.Axes], found: Diagnostics) -> None:
     from matplotlib.ticker import MaxNLocator
 
     peak = max(found.data.max(), np.finfo(float).tiny)
     edges = np.linspace(found.delay[0], found.delay[-1], found.delay.size) * 1e9
     rows = np.arange(found.lengths.size)
-    meshes = []
-    for axes, values, title in zip(
-        panels, (found.data, found.model, found.residual), ("data", "model", "residual"), strict=True
-    ):
-        level = 20 * np.log10(np.maximum(values / peak, 1e-9))
-        meshes.append(
-            axes.pcolormesh(edges, rows, level, vmin=-80, vmax=0, shading="nearest", cmap="inferno", rasterized=True)
-        )
+    look: dict[str, Any] = {"vmin": -80, "vmax": 0, "shading": "nearest", "cmap": "inferno", "rasterized": True}
+    for axes, title in zip(panels, COLOURS, strict=True):
+        level = 20 * np.log10(np.maximum(getattr(found, title) / peak, 1e-9))
+        mesh = axes.pcolormesh(edges, rows, level, **look)
         for sign in (-1, 1):
             horizon = sign * horizon_delay(found.lengths) * 1e9
             axes.plot(horizon, rows, color="white", linestyle="--", linewidth=0.7)
         axes.set(title=f"{title}, {found.polarization}", xlabel=style.DELAY, xlim=(edges[0], edges[-1]))
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     panels[0].set_ylabel("baseline, by length")
-    figure.colorbar(meshes[-1], ax=panels, label="dB of the peak", pad=0.01, aspect=15)
+    figure.colorbar(mesh, ax=panels, label="dB of the peak", pad=0.01, aspect=15)
 
 
-def _draw_profile(axes: Axes, found: Diagnostics) -> None:
-    for values, colour, label in (
-        (found.data, style.BLACK, "data"),
-        (found.model, style.BLUE, "model"),
-        (found.residual, style.ORANGE, "residual"),
-    ):
-        mean = np.sqrt(np.mean(values**2, axis=0))
+def _draw_profile(axes: style.Axes, found: Diagnostics) -> None:
+    for label, colour in COLOURS.items():
+        mean = np.sqrt(np.mean(getattr(found, label) ** 2, axis=0))
         axes.plot(found.delay * 1e9, np.where(mean > 0, mean, np.nan), color=colour, label=label)
-    for sign in (-1, 1):
-        longest = sign * horizon_delay(float(found.lengths.max())) * 1e9
-        axes.axvline(longest, color=style.GREY, linestyle="--", linewidth=0.7)
+    mark_horizon(axes, horizon_delay(float(found.lengths.max())), style.GREY, zorder=2)
     visible = found.data.max() > 0
     axes.set(xlabel=style.DELAY, ylabel=f"rms over baselines ({found.unit})", yscale="log" if visible else "linear")
     axes.margins(x=0)
     axes.legend(loc="best")
 
 
-def _make_logarithmic(axes: Axes, values: np.ndarray) -> None:
+def _make_logarithmic(axes: style.Axes, values: np.ndarray) -> None:
     """Make the vertical axis logarithmic if values differ by more than a factor of `LINEAR_RANGE`."""
     positive = values[np.isfinite(values) & (values > 0)]
     if positive.size and positive.max() > LINEAR_RANGE * positive.min():
         axes.set_yscale("log")
 
 
-def _label_between_powers(axes: Axes) -> None:
+def _label_between_powers(axes: style.Axes) -> None:
     """Label 0.2, 0.3 and 0.5 of a logarithmic vertical axis that is shorter than two decades.
 
     The default labels, such as 6 × 10⁻¹, are so wide that a constrained layout finds no room for the axes.
@@ -186,7 +164,7 @@ def _label_one_digit(value: float, _: float) -> str:
     return f"{value:g}" if digit in LABELLED_DIGITS else ""
 
 
-def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
+def _draw_chi2(panels: list[style.Axes], found: Diagnostics) -> None:
     from matplotlib.ticker import MaxNLocator
 
     antennas = np.arange(found.chi2_antennas.size)
@@ -199,14 +177,14 @@ def _draw_chi2(panels: list[Axes], found: Diagnostics) -> None:
         axes.plot(places, values, color=style.BLUE, linewidth=0.7, marker=".", markersize=2)
         axes.set(xlabel=label, ylabel=r"mean $\chi^2$")
         _make_logarithmic(axes, values)
-    shown = np.unique(np.linspace(0, antennas.size - 1, min(antennas.size, MAX_NAMES)).astype(int))
+    shown = _spread(antennas.size, MAX_NAMES)
     panels[0].set_xticks(shown, found.chi2_antennas[shown], rotation=90, fontsize=style.SMALL_SIZE - 1)
     # A single integration would have an axis of fractions.
     panels[2].xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     panels[2].set_xlim(-0.5, len(integrations) - 0.5)
 
 
-def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
+def _draw_convergence(axes: style.Axes, found: Diagnostics) -> None:
     from matplotlib.ticker import MaxNLocator
 
     for losses, converged in zip(found.losses, found.converged, strict=True):
@@ -217,6 +195,11 @@ def _draw_convergence(axes: Axes, found: Diagnostics) -> None:
     _make_logarithmic(axes, np.concatenate(found.losses or (np.empty(0),)))
     axes.set_title(f"{good} of {count} solves converged (blue)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """Return places spread over a list, at most so many."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 def diagnose(data: UVData, result: CalibrationResult, errors: np.ndarray | None) -> Diagnostics:
@@ -233,32 +216,28 @@ def diagnose(data: UVData, result: CalibrationResult, errors: np.ndarray | None)
     grid = channel_grid(np.asarray(model.freq_array, float))
     flags = flag_cube(result.residual)[..., 0]
     measured = np.where(flags, 0, to_cube(data)[..., 0][:, rows])
-    spectra = [
-        _delay_rms(np.where(flags, 0, cube)[:, order], grid)
-        for cube in (measured, to_cube(model)[..., 0], to_cube(result.residual)[..., 0])
-    ]
+    cubes = {"data": measured, "model": to_cube(model)[..., 0], "residual": to_cube(result.residual)[..., 0]}
+    spectra = {name: _delay_rms(np.where(flags, 0, cube)[:, order], grid) for name, cube in cubes.items()}
     antennas, gains, shown_errors = _shown_gains(result, errors)
     number = int(model.polarization_array[0])
-    records = [record for record in result.solutions if record.polarization == number]
+    records = [one for one in result.solutions if one.polarization == number and one.loss_history.size]
     quality = assess(data, result, 0)
     return Diagnostics(
         polarization=quality.polarization,
         unit=model.vis_units,
         delay=np.fft.fftshift(np.fft.fftfreq(grid.n_channels, grid.width)),
         lengths=lengths[order],
-        data=spectra[0],
-        model=spectra[1],
-        residual=spectra[2],
+        **spectra,
         frequency=np.asarray(model.freq_array, float),
         antennas=antennas,
         gains=gains,
         errors=shown_errors,
-        losses=tuple(record.loss_history / record.loss_history[0] for record in records if record.loss_history.size),
+        losses=tuple(record.loss_history / record.loss_history[0] for record in records),
         chi2_antennas=quality.antennas,
         chi2_by_antenna=quality.chi2_by_antenna,
         chi2_by_channel=quality.chi2_by_channel,
         chi2_by_integration=quality.chi2_by_integration,
-        converged=np.array([record.status == "converged" for record in records if record.loss_history.size]),
+        converged=np.array([record.status == "converged" for record in records]),
     )
 
 
@@ -267,9 +246,7 @@ def _shown_gains(result: CalibrationResult, errors: np.ndarray | None) -> tuple[
     gains = result.gains
     flags = gains.flag_array[..., 0]
     used = np.flatnonzero(~flags.all(axis=(1, 2)))
-    used = (
-        used[np.unique(np.linspace(0, used.size - 1, min(used.size, MAX_ANTENNAS)).astype(int))] if used.size else used
-    )
+    used = used[_spread(used.size, MAX_ANTENNAS)]
     values = np.where(flags[used], np.nan, gains.gain_array[used, :, :, 0])
     times = np.flatnonzero(~flags.all(axis=(0, 1)))
     middle = times[times.size // 2] if times.size else 0

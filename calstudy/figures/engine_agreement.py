@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
 from calstudy.corrupt.levels import rms
 from calstudy.experiment.model import Experiment
 from calstudy.figures import Drawing, StudyFigure
+from calstudy.figures.beam_fit import NO_DELAY
 from calstudy.plotting import style
 from calstudy.power.delay import horizon_delay
 from calstudy.products import simulation
@@ -23,8 +24,6 @@ from calstudy.run.task import Job, Task
 from calstudy.simulate.settings import ENGINES, SimulationSettings
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from pyuvdata import UVData
 
     from calstudy.simulate.floor import DelayFloor, Taper
@@ -35,11 +34,10 @@ SHORT_AND_LONG = (style.BLUE, style.RED)
 
 @dataclass(frozen=True)
 class GroupAgreement:
-    """The difference of two simulations on the baselines of a range of lengths, relative to the rms of these.
+    """The difference of two simulations on the baselines of a range of lengths, m, in units of their `rms_jy`.
 
-    Lengths are in m and `rms_jy` is in Jy. `largest` and `rms` are differences over `rms_jy`. `spectrum` and
-    `difference` are the rms of the delay spectra of the visibilities and of their difference, over the largest of
-    `spectrum`, at delays >= 0 in s, (Ndelays,) each.
+    `spectrum` and `difference` are the rms of the delay spectra of the visibilities and of their difference, over the
+    largest of `spectrum`, at delays >= 0 in s, (Ndelays,) each.
     """
 
     shortest: float
@@ -55,12 +53,11 @@ class GroupAgreement:
 
 @dataclass(frozen=True)
 class EngineAgreement:
-    """Agreement of two simulations of the same foregrounds.
+    """Agreement of two simulations of the same foregrounds, of all visibilities and by ranges of baseline length.
 
-    `groups` are ranges of baseline length that contain baselines, ascending. `largest` and `rms` are differences of all
-    visibilities over their rms. `worst_slot` is the largest difference of any integration and channel over the rms of
-    that integration and channel. `floors` and `differences` are delay floors of the visibilities and of the difference,
-    by taper, relative to the same peaks.
+    `largest` and `rms` are differences over the rms of the visibilities, `worst_slot` the largest of any integration
+    and channel over the rms of that. `floors` and `differences` are delay floors of the visibilities and of the
+    difference, by taper, relative to the same peaks.
     """
 
     groups: tuple[GroupAgreement, ...]
@@ -81,7 +78,7 @@ def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreeme
 
     buffers = floor_buffers(foregrounds)
     if not buffers:
-        raise InputError("instrument.channels: too wide or too few, no delay lies beyond the horizon and the main lobe")
+        raise InputError(NO_DELAY)
     taper: Taper = "dolph-chebyshev" if "dolph-chebyshev" in buffers else next(iter(buffers))
     cube = to_cube(reference)
     difference = from_cube(foregrounds, to_cube(foregrounds) - cube)
@@ -95,9 +92,7 @@ def compare_simulations(foregrounds: UVData, reference: UVData) -> EngineAgreeme
         worst_slot=float((size.max(axis=(1, 3)) / slots).max()),
         taper=taper,
         floors={name: delay_floor(reference, buffer, name, GROUPS) for name, buffer in buffers.items()},
-        differences={
-            name: delay_floor(difference, buffer, name, GROUPS, reference) for name, buffer in buffers.items()
-        },
+        differences={name: delay_floor(difference, gap, name, GROUPS, reference) for name, gap in buffers.items()},
     )
 
 
@@ -133,37 +128,34 @@ def _groups(reference: UVData, difference: UVData, taper: Taper) -> tuple[GroupA
 
 @style.journal_style()
 def draw_engine_agreement(
-    agreement: EngineAgreement,
-    names: tuple[str, str],
-    allowed: float,
-    eor_level: float | None,
-) -> Figure:
+    agreement: EngineAgreement, names: Sequence[str], allowed: float, eor_level: float | None
+) -> style.Figure:
     """Draw delay spectra of short and long baselines (left) and relative differences against baseline length (right).
 
-    `names` are those of the engine and of the reference, and `allowed` is the sum of the node tolerances of both,
-    relative to the rms. `eor_level` is marked, in amplitude dB, if it is not None.
+    `names` are those of the engine and of the reference, `allowed` is the sum of the node tolerances of both, relative
+    to the rms, and `eor_level` is in amplitude dB, or None.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 3.1)
     left, right = figure.subplots(1, 2)
-    ends = (agreement.groups[0], agreement.groups[-1])
-    for group, colour in zip(ends, SHORT_AND_LONG, strict=True):
+    groups = agreement.groups
+    for group, colour in zip((groups[0], groups[-1]), SHORT_AND_LONG, strict=True):
         _draw_spectra(left, group, colour)
     if eor_level is not None:
         left.axhline(eor_level, color=style.BLACK, linewidth=0.6, label="EoR asked for")
     left.set(xlabel=style.DELAY, ylabel="brightness relative to peak (dB)")
     left.margins(x=0)
     left.legend(loc="upper right", frameon=True, framealpha=0.95, edgecolor="none")
-    for name, label, line in (("largest", "largest", "-"), ("rms", "rms", "--")):
-        values = [getattr(group, name) for group in agreement.groups]
-        shortest, longest = zip(*((group.shortest, group.longest) for group in agreement.groups), strict=True)
-        right.hlines(values, shortest, longest, color=style.BLUE, linestyle=line, linewidth=1.2, label=label)
+    shortest, longest = zip(*((group.shortest, group.longest) for group in groups), strict=True)
+    for name, line in (("largest", "-"), ("rms", "--")):
+        values = [getattr(group, name) for group in groups]
+        right.hlines(values, shortest, longest, color=style.BLUE, linestyle=line, linewidth=1.2, label=name)
     right.axhline(allowed, color=style.GREY, linestyle="-.", linewidth=0.8, label="sum of node tolerances")
     right.set(yscale="log", xlabel=style.BASELINE_LENGTH, ylabel=f"|{names[0]} − {names[1]}| / rms")
     right.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, columnspacing=1.0)
     return figure
 
 
-def _draw_spectra(axes: Axes, group: GroupAgreement, colour: str) -> None:
+def _draw_spectra(axes: style.Axes, group: GroupAgreement, colour: str) -> None:
     span = f"{group.shortest:.0f} to {group.longest:.0f} m"
     for values, line, label in ((group.spectrum, "-", f"F, {span}"), (group.difference, ":", f"difference, {span}")):
         level = 10 * np.log10(np.maximum(values, np.finfo(float).tiny))
@@ -216,10 +208,9 @@ class EngineAgreementFigure(StudyFigure):
         """Compare the two simulations."""
         own, other = (read_visibilities(job.inputs[name] / VISIBILITIES) for name in ("own", "against"))
         found = compare_simulations(own, other)
-        first, second = job.settings["engines"]
-        allowed, level = job.settings["node_tolerances"], job.settings["eor_level"]
-        figure = draw_engine_agreement(found, (first, second), allowed, level)
+        names, allowed, level = (job.settings[name] for name in ("engines", "node_tolerances", "eor_level"))
+        figure = draw_engine_agreement(found, names, allowed, level)
         beyond = self.tolerance is not None and found.largest > self.tolerance
-        text = f"{first} and {second} differ by {found.largest:.1e} of the rms, more than {self.tolerance}"
-        numbers = {"largest": found.largest, "rms": found.rms, "worst_slot": found.worst_slot}
+        text = f"{' and '.join(names)} differ by {found.largest:.1e} of the rms, more than {self.tolerance}"
+        numbers = {name: getattr(found, name) for name in ("largest", "rms", "worst_slot")}
         return Drawing(figure, found, {**numbers, "warnings": [text] if beyond else []})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -20,9 +19,6 @@ from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Drawn, Fixed, Rules
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
     from calstudy.experiment.model import Experiment
 
 CSV = "gain-coverage.csv"
@@ -33,7 +29,7 @@ ACROSS = 3
 
 
 @style.journal_style()
-def draw_gain_coverage(members: Mapping[str, Covered]) -> Figure:
+def draw_gain_coverage(members: Mapping[str, Covered]) -> style.Figure:
     """Draw observed against expected fractions, and below it their difference with 1.96 standard errors.
 
     A pair of panels for each member, by name; the name of a single run is empty.
@@ -60,7 +56,7 @@ def draw_gain_coverage(members: Mapping[str, Covered]) -> Figure:
     return figure
 
 
-def _draw_fractions(axes: Axes, member: Covered) -> None:
+def _draw_fractions(axes: style.Axes, member: Covered) -> None:
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], color=style.GREY, linewidth=0.6, zorder=0)
     for name, colour, observed in zip(PARTS, COLOURS, member.observed, strict=True):
@@ -75,7 +71,7 @@ def _draw_fractions(axes: Axes, member: Covered) -> None:
     axes.set(xlim=(0, 1), ylim=(0, 1))
 
 
-def _draw_difference(axes: Axes, member: Covered) -> None:
+def _draw_difference(axes: style.Axes, member: Covered) -> None:
     axes.set_visible(True)
     axes.axhline(0, color=style.GREY, linewidth=0.6, zorder=0)
     for place, (colour, observed) in enumerate(zip(COLOURS, member.observed, strict=True)):
@@ -132,28 +128,24 @@ class GainCoverageFigure(StudyFigure):
 
     def draw(self, job: Job) -> Drawing:
         """Pool the realizations of every member, draw them, and write the table."""
-        members = {name: self._read(folders) for name, folders in members_of(job).items()}
+        members = {
+            name: pooled([read_coverage(folders[parity]) for parity in PARITIES])
+            for name, folders in members_of(job).items()
+        }
         _table(members).write_csv(job.output / CSV)
         shown: Any = members if len(members) > 1 else next(iter(members.values()))
         return Drawing(draw_gain_coverage(members), shown)
-
-    def _read(self, folders: Mapping[str, Path]) -> Covered:
-        return pooled([read_coverage(folders[parity]) for parity in PARITIES])
 
 
 def _table(members: Mapping[str, Covered]) -> Table:
     """Return the percentages of each member and of its worst antenna within 1 and 1.96 errors."""
     records = []
     for name, member in members.items():
+        shown = {"": member.within, "error of that ": member.within_error, "worst antenna ": member.worst}
         for place, part in enumerate(PARTS):
             record: dict[str, Any] = {"member": name, "of": part, "realizations": member.realizations}
             for limit, sigmas in enumerate(("1", "1.96")):
-                record |= {
-                    f"within {sigmas} sigma [%]": round(100 * float(member.within[place, limit]), 2),
-                    f"error of that within {sigmas} sigma [%]": round(
-                        100 * float(member.within_error[place, limit]), 2
-                    ),
-                    f"worst antenna within {sigmas} sigma [%]": round(100 * float(member.worst[place, limit]), 2),
-                }
+                for what, values in shown.items():
+                    record[f"{what}within {sigmas} sigma [%]"] = round(100 * float(values[place, limit]), 2)
             records.append(record)
     return Table.of_records(records)

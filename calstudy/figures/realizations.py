@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from calstudy.base.constants import SIGMAS_95
 from calstudy.base.errors import InputError
 from calstudy.base.units import Wavenumber
 from calstudy.experiment.realizations import described
@@ -25,11 +24,6 @@ from calstudy.products.realizations import RegionResults, read_results
 from calstudy.run.task import Job, Task
 from calstudy.verdicts.tolerances import Arrays, Drawn, Fixed, Measured
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
 OUTSIDE, INSIDE = "outside-wedge", "inside-wedge"
 CORRELATION_COLOURS = "RdBu_r"
 LEVEL = 0.95
@@ -44,12 +38,8 @@ def draw_realizations(
     results: Mapping[str, RegionResults],
     names: Sequence[str],
     max_k: float = 1.0,
-) -> Figure:
-    """Draw statistics of realizations: T, its errors and their correlation, pulls, coverage, corrected power.
-
-    Results are by region, of which those outside and inside the wedge are shown. `names` are the parts that each block
-    draws, such as ``gains and noise``. The axes of k end at `max_k`, h/Mpc.
-    """
+) -> style.Figure:
+    """Draw statistics of realizations by region, up to `max_k`, h/Mpc; `names` are the parts that each block draws."""
     figure = style.new_figure(style.TWO_COLUMNS, 4.9)
     ((transfer, errors, correlation), (pulls, covered, corrected)) = figure.subplots(2, 3)
     outside = results[OUTSIDE]
@@ -65,7 +55,7 @@ def draw_realizations(
     return figure
 
 
-def _draw_transfer(axes: Axes, results: Mapping[str, RegionResults]) -> None:
+def _draw_transfer(axes: style.Axes, results: Mapping[str, RegionResults]) -> None:
     """Draw mean T with the scatter of one realization as bars."""
     for region, marker, colour in ((OUTSIDE, "o", style.BLUE), (INSIDE, "s", style.ORANGE)):
         look = {"fmt": marker, "color": colour, "label": region.replace("-", " the ")}
@@ -75,13 +65,13 @@ def _draw_transfer(axes: Axes, results: Mapping[str, RegionResults]) -> None:
     axes.legend(loc="center right", title="bars: scatter", title_fontsize=style.SMALL_SIZE)
 
 
-def _draw_scatter(axes: Axes, pooled: PooledRegion, name: str, shift: float, look: Mapping[str, Any]) -> None:
+def _draw_scatter(axes: style.Axes, pooled: PooledRegion, name: str, shift: float, look: Mapping[str, Any]) -> None:
     """Draw the mean of a quantity with the scatter of one realization as bars."""
     total = pooled.total[name]
     axes.errorbar(shifted(pooled, shift), total.mean, total.scatter, elinewidth=0.7, **look)
 
 
-def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> None:
+def _draw_errors(axes: style.Axes, results: RegionResults, names: Sequence[str]) -> None:
     """Draw the quoted error of T, and its scatter by the parts that are drawn."""
     pooled = results.pooled
     axes.plot(pooled.k, pooled.total["transfer"].quoted, color=style.BLACK, label="quoted error")
@@ -93,7 +83,9 @@ def _draw_errors(axes: Axes, results: RegionResults, names: Sequence[str]) -> No
     _legend_above(axes, 2)
 
 
-def _draw_correlation(figure: Figure, axes: Axes, results: RegionResults, limits: tuple[float, float]) -> None:
+def _draw_correlation(
+    figure: style.Figure, axes: style.Axes, results: RegionResults, limits: tuple[float, float]
+) -> None:
     """Draw the correlation of T between bins outside the wedge."""
     pooled = results.pooled
     correlation = pooled.total["transfer"].correlation
@@ -114,7 +106,7 @@ def _freedom(pooled: PooledRegion) -> float:
     return float(np.median(freedom[np.isfinite(freedom)]))
 
 
-def _draw_pulls(axes: Axes, results: RegionResults) -> None:
+def _draw_pulls(axes: style.Axes, results: RegionResults) -> None:
     """Draw the mean and the scatter of the pulls of P^R, and the mean of those of P^R / T."""
     pooled = results.pooled
     for kind, (marker, colour, name, shift) in KINDS.items():
@@ -137,7 +129,7 @@ def _draw_pulls(axes: Axes, results: RegionResults) -> None:
     _legend_above(axes, 1)
 
 
-def _draw_coverage(axes: Axes, results: RegionResults) -> None:
+def _draw_coverage(axes: style.Axes, results: RegionResults) -> None:
     """Draw the part of independent draws whose 95 % bars cover, per bin; filled: of P^R / T."""
     pooled = results.pooled
     for kind, (marker, colour, name, shift) in KINDS.items():
@@ -154,7 +146,7 @@ def _draw_coverage(axes: Axes, results: RegionResults) -> None:
     _legend_above(axes, 2)
 
 
-def _draw_corrected(axes: Axes, results: RegionResults) -> None:
+def _draw_corrected(axes: style.Axes, results: RegionResults) -> None:
     """Draw P^R and P^R / T over the input: the mean, with 1.96 times its error by all that was drawn."""
     pooled = results.pooled
     powers = {"P^R": (pooled.values["ratio"] * results.eor, style.GREY, "o", -0.15)}
@@ -163,14 +155,14 @@ def _draw_corrected(axes: Axes, results: RegionResults) -> None:
     for name, (power, colour, marker, shift) in powers.items():
         found = [mean_over_bins(column[:, None], pooled.design) for column in (power / results.put_in).T]
         mean, error = np.transpose([(item.value, item.uncertainty) for item in found])
-        look: dict[str, Any] = {"fmt": marker, "color": colour, "label": f"${name}$ over input"}
-        axes.errorbar(shifted(pooled, shift), mean, SIGMAS_95 * error, elinewidth=0.7, **look)
+        k, label = shifted(pooled, shift), f"${name}$ over input"
+        style.error_bars(axes, k, mean, error, fmt=marker, color=colour, label=label)
     axes.axhline(1, color=style.BLACK, linewidth=0.7, zorder=0)
     axes.set(ylabel=r"mean over the input, $\pm 1.96\,\sigma$", ylim=(0, max(1.35, axes.get_ylim()[1])))
     _legend_above(axes, 1)
 
 
-def _legend_above(axes: Axes, columns: int) -> None:
+def _legend_above(axes: style.Axes, columns: int) -> None:
     """Add the legend of a panel that is full of points."""
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, columnspacing=0.8, handletextpad=0.2)
 
@@ -225,42 +217,30 @@ def _arrays(results: Mapping[str, RegionResults]) -> dict[str, Any]:
     """Return all pooled arrays, and the values of every realization, by region."""
     shown: dict[str, Any] = {}
     for region, found in results.items():
-        pooled = found.pooled
-        shown[region] = {
-            "k": pooled.k,
-            "bin_edges": pooled.bin_edges,
-            "values": dict(pooled.values),
-            "quoted": dict(pooled.quoted),
-            "blocks": {name: list(blocks) for name, blocks in pooled.blocks.items()},
-            "total": dict(pooled.total),
-            "covered": dict(found.covered),
-            "corrected": found.corrected,
-            "eor": found.eor,
-            "input": found.put_in,
-        }
+        pooled = {name: value for name, value in vars(found.pooled).items() if name != "design"}
+        own = {"covered": found.covered, "corrected": found.corrected, "eor": found.eor, "input": found.put_in}
+        shown[region] = pooled | own
     return shown
 
 
-REGION = "outside-wedge"
-SERIES = (("o", style.BLUE), ("s", style.ORANGE))
 CSV = "realizations-comparison.csv"
 
 
 @style.journal_style()
-def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_k: float = 1.0) -> Figure:
-    """Draw T of two arrays with the scatter of one realization, and the mean difference with 1.96 times its error.
+def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_k: float = 1.0) -> style.Figure:
+    """Draw T of two arrays, by title, with the scatter of one realization, and their difference with 95 % bars.
 
-    `arrays` are two, by title, in the same bins; `difference` is T of the first less that of the second. The axis of k
-    ends at `max_k`, h/Mpc.
+    `difference` is T of the first less that of the second. The axis of k ends at `max_k`, h/Mpc.
     """
     figure = style.new_figure(style.ONE_COLUMN, 4.2)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
-    for shift, (marker, colour), (title, pooled) in zip((-0.15, 0.15), SERIES, arrays.items(), strict=True):
+    sides = zip((-0.15, 0.15), style.SERIES[:2], arrays.items(), strict=True)
+    for shift, (marker, colour), (title, pooled) in sides:
         _draw_scatter(upper, pooled, "transfer", shift, {"fmt": marker, "color": colour, "label": title})
     upper.axhline(1, color=style.GREY, linewidth=0.7, zorder=0)
     upper.set_ylabel(TRANSFER)
     upper.legend(loc="lower right", title="bars: scatter of one realization", title_fontsize=style.SMALL_SIZE)
-    lower.errorbar(pooled.k, difference.mean, SIGMAS_95 * difference.error, fmt="o", color=style.BLACK, elinewidth=0.7)
+    style.error_bars(lower, pooled.k, difference.mean, difference.error, fmt="o", color=style.BLACK)
     lower.axhline(0, color=style.GREY, linewidth=0.7, zorder=0)
     lower.set(xlabel=style.WAVENUMBER, ylabel=r"difference of $T$, $\pm 1.96\,\sigma$")
     lower.set_xlim(0, min(max_k, float(pooled.bin_edges[-1])))
@@ -291,27 +271,25 @@ class RealizationsComparison(_OfRealizations):
         for role, title in self.titles.items():
             settings = members[role]
             design = Design(settings["draws"], [(block["draw"], block["members"]) for block in settings["blocks"]])
-            samples = realizations.read_samples(inputs[role], len(design.draws), REGION)
+            samples = realizations.read_samples(inputs[role], len(design.draws), OUTSIDE)
             regions[title] = pool_region(samples, design)
         first, second = regions.values()
         if not np.array_equal(first.bin_edges, second.bin_edges):
             raise InputError(f"{self.label}: the members have different bins of k, expected the same power.bins")
         differences = _differences(first, second)
         _write(job.output / CSV, regions, differences)
-        arrays = {"k": first.k, "bin_edges": first.bin_edges, "difference": differences}
-        shown = {role: dict(region.total) for role, region in zip(self.titles, regions.values(), strict=True)}
-        figure = draw_comparison(regions, differences["transfer"], self.max_k)
-        return Drawing(figure, {**arrays, **shown})
+        shown = {role: regions[title].total for role, title in self.titles.items()}
+        arrays = {"k": first.k, "bin_edges": first.bin_edges, "difference": differences, **shown}
+        return Drawing(draw_comparison(regions, differences["transfer"], self.max_k), arrays)
 
 
 def _differences(first: PooledRegion, second: PooledRegion) -> dict[str, Pooled]:
     """Return the difference of every quantity, realization by realization, pooled over all blocks."""
-    found = {}
-    for name in first.values:
-        values = first.values[name] - second.values[name]
-        quoted = np.hypot(first.quoted[name], second.quoted[name])
-        found[name] = together(values, quoted, [places for _, places in first.design.blocks])
-    return found
+    blocks = [places for _, places in first.design.blocks]
+    return {
+        name: together(values - second.values[name], np.hypot(first.quoted[name], second.quoted[name]), blocks)
+        for name, values in first.values.items()
+    }
 
 
 def _write(path: Path, regions: Mapping[str, PooledRegion], differences: Mapping[str, Pooled]) -> None:

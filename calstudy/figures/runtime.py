@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,11 +16,7 @@ from calstudy.products.run_times import CASE, QUANTILES, PowerLaw, fit_power_law
 from calstudy.run.task import Job
 from calstudy.verdicts.tolerances import MACHINE
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.MAGENTA)
-MARKERS = ("o", "s", "D", "^")
+LOOKS = style.SERIES[:4]
 SHOWN = {
     "paper-step": "paper's Adamax, step",
     "adamax-step": "our Adamax, step",
@@ -34,11 +30,7 @@ CLOCKS = {"cpu": "one core", "gpu": "GPU"}
 
 @dataclass(frozen=True)
 class RuntimeSeries:
-    """Run times of one machine or solver: median and ends of the central 95 %, (Nsizes,), s.
-
-    `size` is the number of antennas, or the longest baseline in m, increasing; `fit` gives the medians as a power of
-    it.
-    """
+    """Run times of one solver and machine, s: median and ends of the central 95 %, (Nsizes,), and their power law."""
 
     label: str
     size: np.ndarray
@@ -61,7 +53,7 @@ def draw_runtime(
     size_label: str,
     symbol: str = r"\mathrm{size}",
     time_label: str = "time per step (s)",
-) -> Figure:
+) -> style.Figure:
     r"""Draw medians (markers), 95 % bands and fitted power laws (lines) on logarithmic axes, in one column.
 
     There are up to eight series, of which the second four have open markers and broken lines. `size_label` and
@@ -70,27 +62,21 @@ def draw_runtime(
     """
     figure = style.new_figure(style.ONE_COLUMN, 2.7 + 0.14 * len(series))
     axes = figure.subplots()
+    # A marker on its fit, and the fitted exponent.
+    entries: dict[str, Any] = {}
     for index, item in enumerate(series):
-        colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(COLOURS)]
-        filled = index < len(COLOURS)
+        filled, (marker, colour) = index < len(LOOKS), LOOKS[index % len(LOOKS)]
         axes.fill_between(item.size, item.low, item.high, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(item.size, item.median, marker, color=colour, markersize=4, markerfacecolor=colour if filled else "w")
-        axes.plot(item.size, item.fit.at(item.size), color=colour, linewidth=0.8, linestyle="-" if filled else "--")
+        look: dict[str, Any] = {"color": colour, "markersize": 4, "markerfacecolor": colour if filled else "w"}
+        (points,) = axes.plot(item.size, item.median, marker, **look)
+        line = "-" if filled else "--"
+        (fit,) = axes.plot(item.size, item.fit.at(item.size), line, color=colour, linewidth=0.8)
+        power = rf"$\propto {symbol}^{{\,{item.fit.exponent:.2f} \pm {item.fit.error:.2f}}}$"
+        entries[f"{item.label} {power}"] = (fit, points)
     axes.set(xscale="log", yscale="log", xlabel=size_label, ylabel=time_label)
     style.label_one_two_five(axes.xaxis)
-    _add_legend(figure, series, symbol)
+    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=1)
     return figure
-
-
-def _add_legend(figure: Figure, series: Sequence[RuntimeSeries], symbol: str) -> None:
-    """Put one line per series above the axes: its marker on its fit, its label, and the fitted exponent."""
-    lines = figure.axes[0].get_lines()
-    # The type hints of matplotlib do not allow several artists as one handle.
-    handles: list[Any] = [(lines[2 * index + 1], lines[2 * index]) for index in range(len(series))]
-    labels = [
-        rf"{item.label} $\propto {symbol}^{{\,{item.fit.exponent:.2f} \pm {item.fit.error:.2f}}}$" for item in series
-    ]
-    figure.legend(handles, labels, loc="outside upper left", ncols=1)
 
 
 class Runtime(StudyFigure):
