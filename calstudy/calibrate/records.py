@@ -83,6 +83,11 @@ class Solve:
         """Whether the solve gave gains."""
         return self.status in USABLE
 
+    @property
+    def times(self) -> slice:
+        """The integrations that were solved together."""
+        return slice(self.integration, self.integration + self.n_integrations)
+
     def summary(self) -> dict[str, Any]:
         """Return all fields as plain JSON types."""
         losses = [json_number(loss) for loss in self.loss_history]
@@ -132,7 +137,7 @@ class CalibrationResult:
 
         Rows are places of antennas, and `place` is that of the polarization. Unity where all integrations are flagged.
         """
-        times = slice(solve.integration, solve.integration + solve.n_integrations)
+        times = solve.times
         gains, flags = (array[rows, :, times, place] for array in (self.gains.gain_array, self.gains.flag_array))
         return np.take_along_axis(gains, flags.argmin(axis=2)[..., None], axis=2)[..., 0]
 

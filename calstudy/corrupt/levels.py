@@ -64,7 +64,7 @@ def radiometer_std(noise: RadiometerNoise, instrument: InstrumentSettings) -> np
     from calstudy.instrument.beams import make_beam
 
     channels = instrument.channels
-    frequencies = channels.first + channels.width * np.arange(channels.count)
+    frequencies = channels.frequencies
     if noise.effective_area is not None:
         areas = [np.full(channels.count, noise.effective_area)] * len(instrument.polarizations)
     else:

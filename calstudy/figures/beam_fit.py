@@ -67,7 +67,7 @@ def compare_interpolations(instrument: InstrumentSettings, step: int = 4) -> Bea
     tabulated = beams[SMOOTH].table.tabulated_frequencies
     difference = _difference(beams[SMOOTH], beams["nearest"], tabulated)
     settings = instrument.channels
-    channels = (settings.first + settings.width * np.arange(settings.count))[::step]
+    channels = settings.frequencies[::step]
     others = {name: _rms(_difference(beam, beams[SMOOTH], channels)) for name, beam in beams.items() if name != SMOOTH}
     largest = np.abs(difference).max(axis=(0, 1, 3, 4))
     return BeamInterpolation(tabulated, _rms(difference), largest, channels, others)

@@ -61,7 +61,12 @@ def draw_sweep(panels: Sequence[SweepPanel]) -> style.Figure:
         axes.set_axis_off()
     for axes in grid[:, 0]:
         axes.set_ylabel(TRANSFER)
-    _add_legend(figure, grid.flat[0], edges, columns)
+    labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
+    labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
+    labels.append("free of the flux scale $s$")
+    scale_free = style.entry(color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6)
+    handles: list[Any] = [*grid.flat[0].containers, scale_free]
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
     return figure
 
 
@@ -87,15 +92,6 @@ def _draw_panel(axes: style.Axes, panel: SweepPanel) -> None:
     axes.tick_params(axis="x", length=0)
     axes.set_xlabel(panel.field)
     axes.set_title(panel.note)
-
-
-def _add_legend(figure: style.Figure, axes: style.Axes, edges: np.ndarray, columns: int) -> None:
-    labels = [rf"$k = {low:g}$–${high:g}$" for low, high in itertools.pairwise(edges)]
-    labels[-1] += r" $h\,\mathrm{Mpc}^{-1}$"
-    labels.append("free of the flux scale $s$")
-    scale_free = style.entry(color=style.GREY, marker="_", markersize=7, linestyle=":", linewidth=0.6)
-    handles: list[Any] = [*axes.containers, scale_free]
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels) if columns > 1 else 2)
 
 
 class Sweep(StudyFigure):

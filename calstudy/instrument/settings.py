@@ -69,6 +69,11 @@ class Channels(Section):
         return self.first, self.first + (self.count - 1) * self.width
 
     @property
+    def frequencies(self) -> np.ndarray:
+        """Centres of all channels, (Nfreqs,), Hz."""
+        return self.first + self.width * np.arange(self.count)
+
+    @property
     def label(self) -> str:
         """Number, width and first of the channels."""
         return f"{self.count} channels of {self.width / 1e3:g} kHz from {self.first / 1e6:g} MHz"

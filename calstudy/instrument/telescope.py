@@ -42,7 +42,7 @@ def make_template(settings: InstrumentSettings, autos: bool = False, as_built: b
         _telescope(layout),
         np.column_stack([layout.numbers[first], layout.numbers[second]]),
         times=start + np.arange(times.count) * times.integration / SECONDS_PER_DAY,
-        frequencies=channels.first + np.arange(channels.count) * channels.width,
+        frequencies=channels.frequencies,
         resolution=(times.integration, channels.width),
         polarizations=np.array([POLARIZATION_NUMBERS[polarization] for polarization in settings.polarizations]),
     )

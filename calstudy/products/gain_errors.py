@@ -110,7 +110,7 @@ class OfSolves(Calibrated):
         data = prepared.data
         errors = [ErrorsInTime(data.frequencies, data.lengths.max()) for _ in range(data.n_polarizations)]
         for solve in result.solutions:
-            times = slice(solve.integration, solve.integration + solve.n_integrations)
+            times = solve.times
             place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
             gains = result.solved_gains(solve, rows, place)
             problem = problem_at(prepared, settings, times, place, gains, solve)
@@ -197,8 +197,7 @@ class ErrorsOfGains(OfSolves, stage="gain-errors", version=8):
     def _by_realizations(self, result: CalibrationResult, errors: np.ndarray, solve: Solve) -> dict[str, Any]:
         """Return the record of a solve whose errors are from realizations."""
         place = int(np.flatnonzero(result.model.polarization_array == solve.polarization)[0])
-        times = slice(solve.integration, solve.integration + solve.n_integrations)
-        at = (slice(None), slice(None), times, place)
+        at = (slice(None), slice(None), solve.times, place)
         if not np.isfinite(errors[0][at]).any():
             flagged = result.gains.flag_array[at].all()
             return {"reason": "all gains are flagged" if flagged else "gains do not change with the noise of the data"}

@@ -337,14 +337,13 @@ class _OfData(Task):
         if not usable:
             return None
         record = usable[len(usable) // 2]
-        times = slice(record.integration, record.integration + record.n_integrations)
         prepared = prepared_fit(self.calibrator, *read_observed(self.data, self.calibrator, self.sky_model))
         rows = positions(result.gains.ant_array, prepared.data.numbers)
         gains = result.solved_gains(record, rows, polarization)
-        problem = problem_at(prepared, self.calibrator, times, polarization, gains, record)
+        problem = problem_at(prepared, self.calibrator, record.times, polarization, gains, record)
         if isinstance(problem, str):
             return None
-        model = to_cube(result.model)[times, :, :, polarization].reshape(problem.visibilities.shape)
+        model = to_cube(result.model)[record.times, :, :, polarization].reshape(problem.visibilities.shape)
         probes = None if jacobian_size(problem) <= DENSE else self.probes
         return expected_of(problem, gains, model, DelayModes(prepared.data.frequencies, taper), probes)
 

@@ -273,8 +273,7 @@ class ObservedQuality(Task, stage="observed-quality", version=3):
         for record in result.solutions:
             if not record.usable:
                 continue
-            times = slice(record.integration, record.integration + record.n_integrations)
-            problem = make_problem(prepared, settings, times, polarizations.index(record.polarization))
+            problem = make_problem(prepared, settings, record.times, polarizations.index(record.polarization))
             found = None if isinstance(problem, str) else count_unknowns(problem, settings)
             if found is None:
                 return None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calstudy.base.errors import InputError
+from calstudy.base.quiet import without_warnings
 from calstudy.base.visibilities import antenna_pairs, flag_cube, to_cube
 from calstudy.realdata.settings import Interference
 
@@ -79,9 +79,8 @@ def _cells(amplitudes: np.ndarray, known: np.ndarray, settings: Interference) ->
         if min(seen[part].shape) < LEAST_INTEGRATIONS:
             continue
         values = _filled(amplitudes[:, baseline][part].astype(float), seen[part])
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            # hera_qm warns of fewer integrations than its box holds.
-            warnings.simplefilter("ignore")
+        # hera_qm warns of fewer integrations than its box holds.
+        with without_warnings():
             stand_out = xrfi_waterfall(values, nsig_init=settings.significance, nsig_adj=settings.adjacent_significance)
         hits[:, baseline][part] = stand_out & seen[part]
     cells, channels, integrations = (

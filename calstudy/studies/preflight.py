@@ -217,7 +217,7 @@ def _of_file(foregrounds: GleamSources | FileSources, channels: Channels, digest
     from calstudy.sky.foregrounds import make_foregrounds
 
     del digest
-    return make_foregrounds(foregrounds, channels.first + channels.width * np.arange(channels.count)).sky.Ncomponents
+    return make_foregrounds(foregrounds, channels.frequencies).sky.Ncomponents
 
 
 def require_calibration(experiment: Experiment) -> None:
@@ -282,7 +282,7 @@ def frame_of(instrument: InstrumentSettings) -> Frame:
         layout.numbers[order],
         layout.enu[order],
         places[np.column_stack(np.triu_indices(len(order), 1))],
-        channels.first + channels.width * np.arange(channels.count),
+        channels.frequencies,
         instrument.times.count,
         len(instrument.polarizations),
     )

@@ -37,7 +37,7 @@ class ChannelFlags(Effect):
 
     def refusal(self, size: Size) -> str | None:
         """Refuse to flag all channels."""
-        frequencies = size.channels.first + size.channels.width * np.arange(size.channels.count)
+        frequencies = size.channels.frequencies
         if not self._flagged(frequencies).all():
             return None
         flagged = f"all {size.channels.count} channels would be flagged"

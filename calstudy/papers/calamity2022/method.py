@@ -36,7 +36,7 @@ def _vectors_over_bandwidth(run: Results, buffered: bool) -> Finding:
     if not isinstance(calibration, ForegroundFit):
         raise Unevaluated(f"{calibration.label} fits no foregrounds")
     channels, lengths = instrument.channels, pdist(make_array(instrument).enu)
-    frequencies = channels.first + channels.width * np.arange(channels.count)
+    frequencies = channels.frequencies
     vectors = np.empty(lengths.size)
     for bucket in make_basis(lengths, frequencies, calibration.basis).buckets:
         vectors[bucket.members] = bucket.vectors.shape[1]

@@ -125,7 +125,7 @@ class Noise(Step):
 def noise_power(instrument: InstrumentSettings, power: PowerSettings, levels: Levels) -> float:
     """Return P_N of one baseline and the first polarization in mK2 h-3 Mpc3; see the module."""
     channels = instrument.channels
-    frequencies = channels.first + channels.width * np.arange(channels.count)
+    frequencies = channels.frequencies
     omega_p, omega_pp = make_beam(instrument.beam, channels).solid_angles(frequencies, instrument.polarizations[0])
     sigma = levels.noise if levels.noise_spectrum is None else np.array(levels.noise_spectrum)[:, 0]
     temperature = 1e3 * sigma / np.sqrt(instrument.times.count) * kelvin_per_jansky(frequencies, omega_p, None)
