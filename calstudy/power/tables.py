@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import h5py
 import numpy as np
@@ -14,10 +14,8 @@ from calstudy.base.table import Table
 from calstudy.power.spectra import SphericalSpectrum
 from calstudy.power.transfer import TransferFunction
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Spectrum = TypeVar("Spectrum", bound="DataclassInstance")
+Spectrum = TypeVar("Spectrum")
+"""A dataclass of arrays and numbers."""
 
 CSV_COLUMNS = {
     "k [h/Mpc]": lambda s: s.k,
@@ -49,7 +47,7 @@ TRANSFER_COLUMNS = {
 }
 
 
-def save_spectrum(path: Path, spectrum: DataclassInstance) -> None:
+def save_spectrum(path: Path, spectrum: Any) -> None:
     """Write every field as an HDF5 data set of its name with the attribute ``unit``, replacing the file."""
     with h5py.File(path, "w") as file:
         file.attrs["kind"] = type(spectrum).__name__
@@ -65,7 +63,8 @@ def load_spectrum(path: Path, kind: type[Spectrum]) -> Spectrum:
         if found != kind.__name__:
             raise ValueError(f"{path} holds {found!r}, expected {kind.__name__!r}")
         # A field that an older file lacks has its default.
-        values = {item.name: _value(file[item.name]) for item in dataclasses.fields(kind) if item.name in file}
+        fields = dataclasses.fields(cast(Any, kind))
+        values = {item.name: _value(file[item.name]) for item in fields if item.name in file}
     return kind(**values)
 
 
