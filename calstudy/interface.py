@@ -186,8 +186,8 @@ class CalibratedData:
     def draw_gains(self, seed: int) -> UVCal:
         """Return the gains with a draw of their errors, for errors of baselines that were not fitted.
 
-        The noise of fitted baselines is not independent of that of their gains. Raises InputError if the calibration
-        has no errors, or smooth gains: draws are independent by channel.
+        The noise of fitted baselines is not independent of that of their gains, and needs no draws. Raises InputError
+        if the calibration has no errors, or smooth gains: draws are independent by channel, and such errors are not.
         """
         if smoothed := [name for name in SMOOTHING if self.solution["settings"].get(name) is not None]:
             raise InputError(
@@ -267,7 +267,8 @@ class LoadedStudy:
     def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
         """Return the stages of a run with the estimated time, memory and disk.
 
-        By default there is a worker process for each core; all share `max_memory`, such as "6 GB", or all that is free.
+        By default there is a worker process for each core, as far as the memory allows. `max_memory` is that of all
+        workers together, such as "6 GB"; by default all free memory.
         """
         return StudyPlan(describe_plan(self._study, Budget(workers, max_memory)))
 
@@ -278,9 +279,9 @@ class LoadedStudy:
         scheduler: str | None = None,
         quiet: bool = False,
     ) -> OpenRun:
-        """Make all products that are not in the store, and fill the run folder; parameters as for `plan`.
+        """Make all products that are not in the store, and fill the run folder; if `quiet`, without printed progress.
 
-        `scheduler` is the address of a running dask scheduler in place of workers.
+        Workers and memory are as for `plan`; `scheduler` is the address of a running dask scheduler in place of them.
         """
         finished = run_study(self._study, Budget(workers, max_memory, scheduler), Console(quiet=quiet))
         return open_run(finished.folder)
@@ -379,7 +380,8 @@ class OpenRun:
         """Return which calibrators of a comparison have a bias below a limit in all, or some, worlds, by band of k.
 
         Columns are `standing` ("passes", "open" or "fails"), `worlds`, those that decide, `bias_below`, the 95 % upper
-        limit in units of the EoR, and `transfer`, the smallest T (`calstudy.verdicts.standing`).
+        limit in all worlds in units of the EoR, and `transfer`, the smallest T, of the linear response where that is
+        lower by more than the error of T.
         """
         import pandas
 
@@ -446,7 +448,8 @@ class OpenRun:
     def gain_errors(self, variant: str = "residual", half: Half = "even") -> xarray.Dataset:
         """Compute standard deviations of gains by noise, `amplitude` and `phase`, from the products in the store.
 
-        Raises InputError, with the reason, if they are not known for the calibrator or the size of the array.
+        Variant and half are as for `gains`. Raises InputError, with the reason, if the errors are not known for the
+        calibrator or the size of the array.
         """
         self._calibration(variant, half)
         task = errors_of_gains(self._experiment.graph, self._variant(variant), half)

@@ -224,8 +224,8 @@ MUTATIONS = (
     ),
     Mutation(
         "files of others take from other files",
-        "        if not isinstance(link, h5py.HardLink):\n            return",
-        "        if False:\n            return",
+        "            if not isinstance(link, h5py.HardLink):\n                return",
+        "            if False:\n                return",
         ("tests/studies/test_forged_scores.py",),
     ),
     Mutation(
@@ -319,6 +319,12 @@ MUTATIONS = (
         KEYS,
     ),
     Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, warn):", "if True:", STORE),
+    Mutation(
+        "store deletes what a run needs",
+        "            if key not in needed:\n",
+        "            if True:\n",
+        ("tests/test_start_commands.py",),
+    ),
     Mutation("verify reads no file", 'sha256(self.folder(stage, key) / name) == entry["sha256"]', "True", STORE),
     Mutation("a kept product is dropped", ' and product.record.get("temporary")', "", STORE),
     Mutation(

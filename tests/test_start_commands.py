@@ -19,7 +19,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.package_files import experiment_names, published
 from calstudy.cli import main as cli
 from calstudy.experiment.files import dump, override, parse_yaml, validate
-from calstudy.run.store import Store
+from calstudy.run.store import Lease, Store
 from calstudy.studies.load import load_study
 from calstudy.studies.reference import SCHEMA_FILE, experiment_schema
 
@@ -266,6 +266,13 @@ def test_exported_data_among_runs_are_no_run(used_store, here, capsys):
     (here / "runs" / "exported").mkdir()
     (here / "runs" / "exported" / "manifest.json").write_text('{"calstudy": "1", "digest": "", "data": []}')
     assert "2 products" in output_of(capsys, "store", "--unreferenced")
+
+
+def test_what_a_run_needs_at_this_time_is_not_deleted(used_store, capsys):
+    with Lease(used_store).holding([key_of("a")]):
+        told = output_of(capsys, "store", "--older-than", "0h", "--delete")
+    assert "kept, for a run needs it: average (a)" in told
+    assert keys(used_store) == {"a"}
 
 
 @pytest.mark.parametrize("place", ["average/notes", "my.folder/of.mine", f"average/{key_of('e')}", "mine/product.json"])

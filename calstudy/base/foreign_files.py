@@ -60,14 +60,19 @@ def _foreign(file: h5py.File) -> str | None:
     """Return in words what a file takes from other files, or None."""
     import h5py
 
-    def look(name: str, link: object) -> str | None:
-        if isinstance(link, h5py.SoftLink):
-            return None  # Its target is found as what it is.
-        if not isinstance(link, h5py.HardLink):
-            return f"/{name} is an external link"
-        item = file[name]
-        if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
-            return f"/{name} is {'a virtual data set' if item.is_virtual else 'external raw data'}"
-        return None
-
-    return file.visititems_links(look)
+    groups, seen = [file["/"]], {hash(file["/"].id)}
+    while groups:
+        group = groups.pop()
+        for name in group:
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.SoftLink):
+                continue  # Its target is found as what it is.
+            if not isinstance(link, h5py.HardLink):
+                return f"{group.name.rstrip('/')}/{name} is an external link"
+            item = group[name]
+            if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+                return f"{item.name} is {'a virtual data set' if item.is_virtual else 'external raw data'}"
+            if isinstance(item, h5py.Group) and hash(item.id) not in seen:
+                seen.add(hash(item.id))
+                groups.append(item)
+    return None

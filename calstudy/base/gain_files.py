@@ -219,7 +219,10 @@ def read_gain_pair(first: Path, second: Path) -> tuple[UVCal, UVCal]:
 
 
 def find_reader(path: Path) -> tuple[str, Reader] | None:
-    """Return the kind of a file, in words, and what reads it, or raises ValueError; None if none of those here does."""
+    """Return the kind of a file, in words, and what reads it, or None if it is none of those here; may raise OSError.
+
+    The readers raise ValueError with a sentence if the file is not as its format demands.
+    """
     import h5py
     from astropy.io import fits
 

@@ -1,4 +1,8 @@
-"""Visibilities and the metadata of their array, which are known before there are data, as arrays from a UVData."""
+"""Visibilities and the metadata of their array as plain arrays, extracted once from a UVData.
+
+`Frame` has the metadata that are known before there are data: antennas, baselines, channels. `Observation` adds the
+visibilities.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,13 @@ if TYPE_CHECKING:
 class Frame:
     """Antennas, baselines and channels. All arrays are read-only.
 
-    `numbers` are those of the antennas that are in a baseline, ascending, and `positions` theirs, east, north, up, m,
-    (Nants, 3). `antennas` are the two of each baseline as indices into `numbers`, (Nbls, 2), and `frequencies` the
-    channel centres, Hz.
+    Parameters
+    ----------
+    numbers : number of each antenna that is in a baseline, ascending, (Nants,) int
+    positions : antenna positions, east, north, up, m, (Nants, 3)
+    antennas : the two antennas (a, b) of each baseline as indices into `numbers`, (Nbls, 2) int
+    frequencies : channel centres, Hz, (Nfreqs,)
+    n_times, n_polarizations : numbers of integrations and polarizations
     """
 
     def __init__(
@@ -88,8 +96,14 @@ class Frame:
 class Observation(Frame):
     """Visibilities of every baseline at every time, with their antennas, baselines and channels.
 
-    They are of a UVData, which is not copied, must not be changed afterwards, and may be without data. Raises
-    InputError unless it is rectangular and time-major. `times` are Julian dates, and `polarizations` AIPS numbers.
+    They are of a UVData, rectangular and time-major: all baselines of the first integration, then of the second, and so
+    on. It is not copied, and must not be changed afterwards. It may be without data; then there are no visibilities.
+    Raises InputError if it is not rectangular.
+
+    Attributes
+    ----------
+    times : Julian date of each integration, (Ntimes,)
+    polarizations : AIPS numbers, such as -5 for XX, (Npols,)
     """
 
     def __init__(self, uvd: UVData) -> None:

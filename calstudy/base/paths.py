@@ -27,7 +27,7 @@ def with_value(
     """Return a copy of a block with the field at a dotted path set to a value.
 
     Items of a list are counted from 0. Keys of the block may themselves be dotted paths. `block_for` returns the block
-    for a path and a value above the field that is none, or None.
+    or list for a value above the field, with its path, that is neither; None if there is none.
     """
     result = deepcopy(dict(content))
     block: Any = result

@@ -33,7 +33,8 @@ FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]
 class Plugin(Section):
     """The base class of all plug-ins. Subclasses declare settings as fields, and behaviour as methods.
 
-    The base class of each kind sets the `registry`. The version of a built-in one is raised when its results change.
+    The base class of each kind sets the `registry`. The version of a built-in plug-in is increased whenever its results
+    change, so that the products that depend on it are made again.
     """
 
     registry: ClassVar[Registry]
@@ -90,8 +91,9 @@ class Registry(Kinds[P]):
     """All plug-ins of one kind: the built-in ones, those of installed packages, and those in files.
 
     The `noun` names the kind, such as "calibrator", and `base_path` is ``module:class`` of its base class. The built-in
-    ones are in the modules of `package`; module `sky_based` contains ``sky-based``. With `families`, a module may have
-    several classes or none; names that are defaults of the tag are read from its text, without importing it.
+    ones are in the modules of `package`; module `sky_based` contains ``sky-based``, and modules whose name starts with
+    an underscore contain none. With `families`, a module may have several classes or none, and a class several names
+    (`Plugin.names`); names that are defaults of the tag are read from the text of the modules, without importing them.
     """
 
     def __init__(self, noun: str, package: str, base_path: str, tag: str = "kind", families: bool = False) -> None:
@@ -158,7 +160,10 @@ class Registry(Kinds[P]):
         return [*self.built_in(), *sorted(set(self.installed()) - set(self.built_in()))]
 
     def find(self, reference: str) -> type[P]:
-        """Return the class of a plug-in, given a name or a Python file, with ``:Class`` if it has several, or raise."""
+        """Return the class of a plug-in, given a name or the path of a Python file, with ``:Class`` if it has several.
+
+        Raises InputError if there is none; the message does not name the field.
+        """
         if (file := FILE_REFERENCE.fullmatch(reference)) is not None:
             return self._in(load_file(Path(file["path"])), reference, file["name"])
         if reference in self._modules:
@@ -260,5 +265,8 @@ def _named_after(module: str) -> str:
 
 
 def guarded(thing: Plugin) -> AbstractContextManager[None]:
-    """Return a context for calls of a plug-in, in which errors of a user's code become `UserCodeError`; ours pass."""
+    """Return a context for calls of a plug-in's methods, in which errors of a user's code become `UserCodeError`.
+
+    Errors of built-in plug-ins pass unchanged.
+    """
     return nullcontext() if thing.is_built_in else user_code(thing.label)

@@ -56,9 +56,10 @@ def cpu_time() -> float:
 
 @dataclass
 class Usage:
-    """Elapsed seconds, CPU seconds (see `cpu_time`) and peak resident memory (bytes) of a block of code, after it.
+    """Elapsed seconds, CPU seconds (see `cpu_time`) and peak resident memory (bytes) of a block of code.
 
-    The memory is that of this process alone, sampled every 50 ms.
+    Use it as a context manager; the values are available after the block. The memory is that of this process alone,
+    sampled every 50 ms.
     """
 
     seconds: float = 0.0

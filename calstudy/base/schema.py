@@ -80,7 +80,10 @@ class Section(BaseModel):
 
 @cache
 def defaults(section: type[BaseModel]) -> Mapping[str, Any]:
-    """Return the default of every field of a section, kept because copies are slow; they must not be changed."""
+    """Return the default of every field of a section; it must not be changed.
+
+    The defaults are cached, because pydantic makes a new copy at every call, which is slow.
+    """
     return {name: field.get_default(call_default_factory=True) for name, field in section.model_fields.items()}
 
 
@@ -97,9 +100,10 @@ S = TypeVar("S", bound=Section)
 
 
 class Kinds(Generic[S]):
-    """The kinds of block that a field may hold, of which its field `tag` names one; a name alone has the defaults.
+    """The kinds of block that a field may hold, of which the field `tag` of the block names one.
 
-    The kinds are those in the type of the field: sections with a literal as tag, and words, which stand for no block.
+    A name alone stands for the block with its defaults: ``beam: airy`` for ``beam: {kind: airy}``. The kinds are those
+    in the type of the field: sections with a literal as tag, and words, which stand for no block.
     """
 
     def __init__(self, tag: str) -> None:
@@ -159,8 +163,9 @@ class Kinds(Generic[S]):
     def make(self, block: Any, default: str | None = None, **context: Any) -> S:
         """Return the section that a name, a path or a block of settings describes; a section or word is unchanged.
 
-        A block without the tag is of the kind `default`. Relative paths of files start at the `folder` of the context,
-        or the working directory. Raises pydantic.ValidationError for the settings, and InputError for the kind.
+        A block without the tag is of the kind `default`. Relative paths of files start at the `folder` of the context
+        of the validation, or at the working directory. Raises pydantic.ValidationError if the settings are invalid, and
+        InputError if there is no such kind.
         """
         if isinstance(block, self.base) or block in self.words:
             return block

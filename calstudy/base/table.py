@@ -66,9 +66,9 @@ class Table:
         return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
     @classmethod
-    def of_records(cls, records: Sequence[Mapping[str, Any]]) -> Table:
-        """Return the table of records, whose cells are empty where a record lacks a column."""
-        columns = list(dict.fromkeys(column for record in records for column in record))
+    def of_records(cls, records: Sequence[Mapping[str, Any]], first: str | None = None) -> Table:
+        """Return the table of records, with empty cells where a record lacks a column; of none, the `first` column."""
+        columns = list(dict.fromkeys(column for record in records for column in record)) or [first or ""]
         return cls(columns, [[record.get(column, "") for column in columns] for record in records])
 
     def csv(self) -> str:

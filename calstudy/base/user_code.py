@@ -120,7 +120,7 @@ def load_file(path: Path) -> ModuleType:
     name = f"{FILE_MODULE}{path.stem}_{hashlib.sha256(f'{path}{content}'.encode()).hexdigest()[:12]}"
     if name in sys.modules:
         return sys.modules[name]
-    loader = _Uncompiled(name, str(path))
+    loader = _Uncompiled(name, str(path.absolute()))
     spec = importlib.util.spec_from_file_location(name, path, loader=loader)
     assert spec is not None, "there is a loader"
     module = importlib.util.module_from_spec(spec)
@@ -183,7 +183,9 @@ class _Beside(MetaPathFinder):
         del path, target
         if (file := self.files.get(fullname)) is None:
             return None
-        return importlib.util.spec_from_file_location(fullname, file, loader=_Uncompiled(fullname, str(file)))
+        return importlib.util.spec_from_file_location(
+            fullname, file, loader=_Uncompiled(fullname, str(file.absolute()))
+        )
 
 
 _LATER: dict[str, Path] = {}

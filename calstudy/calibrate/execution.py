@@ -213,8 +213,14 @@ def run_calibrator(
     Raises InputError if the data or the sky model cannot be used, the calibrator refuses them, or a user's calibrator
     fails or returns an invalid calibration.
 
-    Data, and the sky model if there is one, with the samples of the data, are rectangular and time-major; they are not
-    changed. For gains to start from and `noise` see `Assumed`.
+    Parameters
+    ----------
+    calibrator : any calibrator, built in or a user's
+    data : visibilities, rectangular and time-major; not changed
+    sky_model : visibilities of the known part of the sky, with the samples of `data`, or None; not changed
+    gains : gains to start from, for an iterative calibrator; None for the calibrator's own start
+    progress : called after each solve with the number done and the total
+    noise : standard deviation of the noise of a sample (see `Assumed`); None if it is not known
     """
     observation = Observation(data)
     sky = None if sky_model is None else Observation(sky_model)

@@ -51,7 +51,7 @@ import numpy as np
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.calibrate.basis import gain_vectors
 from calstudy.calibrate.gain_variances import Alignment, as_a_whole, by_antenna, by_channel
-from calstudy.calibrate.problem import CalibrationProblem, gain_products
+from calstudy.calibrate.problem import CalibrationProblem, FitStructure, gain_products
 from calstudy.calibrate.tangent_space import SPAN_CUTOFF, TangentSpace
 
 ORDERS = 3
@@ -91,7 +91,8 @@ class GainErrors:
     zero if there are none, and `smooth_fraction` their part of the numbers in the gains. `unevenness` is the mean over
     the median of the residual's power in channels: about one for noise, more for interference. `signal_to_noise` is
     that of |g| of each antenna for given foregrounds, the median over channels, and `noise_alone` what noise alone
-    makes of it, (Nants,).
+    makes of it, (Nants,). `noise_from` says whether the variance of the noise is that of the weights, or from the
+    residual of this solve, and `absorbed` what foregrounds absorb.
     """
 
     amplitude: np.ndarray = field(metadata={"unit": ""})
@@ -220,6 +221,14 @@ def _signal_to_noise(
     return found[0], found[1]
 
 
+class _Last(NamedTuple):
+    structure: FitStructure
+    weights: np.ndarray
+    deviations: tuple[float, float]
+    time: float
+    absorbed: Absorption
+
+
 class ErrorsInTime:
     """Errors of solves of one polarization, in the order of time; see `gain_errors`.
 
@@ -229,7 +238,7 @@ class ErrorsInTime:
     def __init__(self, frequencies: np.ndarray, longest: float) -> None:
         self._frequencies = frequencies
         self._fringe = SPEED_OF_LIGHT / (frequencies.max() * longest) / (2 * np.pi * TURNS_PER_DAY)
-        self._last: tuple[CalibrationProblem, float, Absorption] | None = None
+        self._last: _Last | None = None
 
     def of(
         self, problem: CalibrationProblem, gains: np.ndarray, model: np.ndarray, time: float, settled: bool = True
@@ -241,22 +250,22 @@ class ErrorsInTime:
         absorbed = self._known(problem, time)
         found = gain_errors(problem, gains, model, self._frequencies, absorbed)
         if absorbed is None and settled and isinstance(found, GainErrors):
-            self._last = problem, time, found.absorbed
+            self._last = _Last(problem.structure, problem.weights, problem.deviations, time, found.absorbed)
         return found
 
     def _known(self, problem: CalibrationProblem, time: float) -> Absorption | None:
         """Return the last absorption if it is of the same samples and prior, and within a fringe; else None."""
-        if self._last is None:
+        last = self._last
+        if last is None or not 0 <= time - last.time < self._fringe or problem.structure != last.structure:
             return None
-        last, before, absorbed = self._last
-        near = 0 <= time - before < self._fringe and problem.structure == last.structure
-        if not near or not np.array_equal(problem.weights > 0, last.weights > 0):
+        if not np.array_equal(problem.weights > 0, last.weights > 0):
             return None
         # A finite prior is weighed against the noise.
-        levels = [[*one.deviations, np.mean(one.weights)] for one in (problem, last)]
-        if problem.structure.prior != "none" and not np.allclose(levels[0], levels[1], SIMILAR, atol=0):
-            return None
-        return absorbed
+        if problem.structure.prior != "none":
+            levels = [np.mean(weights) for weights in (problem.weights, last.weights)]
+            if not np.allclose([*problem.deviations, levels[0]], [*last.deviations, levels[1]], SIMILAR, atol=0):
+                return None
+        return last.absorbed
 
 
 def within(spans: Sequence[np.ndarray], change: np.ndarray) -> np.ndarray:

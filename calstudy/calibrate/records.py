@@ -120,11 +120,15 @@ class Solve:
 class CalibrationResult:
     """The result of `calstudy.calibrate.execution.run_calibrator`.
 
-    Gains g have the convention ``divide``: V = g_a g_b* m. They are flagged where an antenna has no data in a channel
-    of an integration, even if it shares its gain with others, and where a solve was skipped or failed; unity there. The
-    model is the intrinsic foregrounds F, in the unit of the data, times the closure factors c_ab if there are any. The
-    residual is R = V / (c_ab g_a g_b*) - F, zero where flagged. There is one record per solve, polarization by
-    polarization, each in the order of time.
+    Attributes
+    ----------
+    gains
+        Gains g of each antenna, channel and integration, gain convention ``divide``: V = g_a g_b* m. Flagged where
+        an antenna has no data in a channel of an integration, even if it shares its gain with others, and where a solve
+        was skipped or failed; unity there.
+    model : the intrinsic foregrounds F, in the unit of the data, times the closure factors c_ab if there are any
+    residual : R = V / (c_ab g_a g_b*) - F, zero where flagged
+    solutions : one record per solve, polarization by polarization, each in the order of time
     """
 
     gains: UVCal

@@ -84,7 +84,7 @@ def refusals_of_run(paper: Paper, results: Results | PooledResults | RunTimeTabl
 
 
 def _refusals(paper: Paper, runs: Mapping[str, Results | PooledResults]) -> dict[str, str | None]:
-    """Return the same for the roles of a paper, because another may have a role of the same name, that runs play."""
+    """Return why runs cannot play their roles, None for those that can; another paper may have roles of these names."""
     with guarded(paper):
         return {role: paper.refusal_of_run(role, run) for role, run in runs.items() if role in paper.roles}
 
@@ -201,10 +201,11 @@ INSTEAD = "use --run-code if you trust who wrote the folder, or, if it is a pape
 def evaluate_folder(folder: Path, papers: Sequence[str] = (), run_code: bool = True) -> Evaluation:
     """Evaluate statements of papers on the tables of a run folder, and write claims.json and claims.md into it.
 
-    If members of a collection differ only in the paper's own solver, claims-by-solver.json and .md are written too, and
-    nothing if no statement is evaluated. `papers` are names or files in place of those that the run names. Python files
-    of these are always run, those of the folder's experiments only with `run_code`. Raises
-    InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
+    The folder is that of a run, or of a collection, whose members' folders are beside it. If members differ only in the
+    paper's own solver, claims-by-solver.json and .md are written too. If no statement is evaluated, nothing is written.
+    `papers` are names or files in place of those that the run names. Python files of these are always run, those of the
+    folder's experiments only with `run_code`.
+    Raises InputError for another folder, if it names no paper or code that may not be run, or cannot be written.
     """
     run = RunFolder(folder)
     _require_evaluable(run)
@@ -298,7 +299,10 @@ def claims(
     notes: Sequence[str],
     roles: Mapping[str, str] | None = None,
 ) -> Task | None:
-    """Return the task that evaluates papers on a run without a name, or on several by role; None without papers."""
+    """Return the task that evaluates the statements of papers on a run, or on several by role; None without papers.
+
+    A single run has no name. The notes are the substitutions of all runs for the papers' ingredients.
+    """
     if not papers:
         return None
     playing = runs if roles is None else {name: runs[name] for name in roles.values()}

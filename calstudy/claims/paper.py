@@ -18,10 +18,14 @@ if TYPE_CHECKING:
 class Paper(Plugin):
     """Base class of papers.
 
-    The `citation` has authors, year, title and identifier. `roles` are those of runs in the paper's statements, each
-    with a description of the run in words that follow "needs", and `usual_members` the names of the members of a
-    collection that play them, unless its file names others. `own_solver_roles` has for a role that of the run which
-    differs only in its solver, the paper's own: if both are played, every statement is evaluated with either solver.
+    Attributes
+    ----------
+    citation : authors, year, title, identifier
+    roles : roles of runs in the paper's statements, with a description of the run in words that follow "needs"
+    usual_members : name of the member of a collection that plays a role, unless its file names another
+    own_solver_roles
+        For a role, the role of the run that differs only in its solver, which is the paper's own. If both are
+        played, every statement is evaluated with either solver.
     """
 
     registry: ClassVar = PAPERS
@@ -33,8 +37,10 @@ class Paper(Plugin):
     kind: str
 
     def statements(self) -> Sequence[Statement]:
-        """Return the statements, in the order of the paper; by default those of the module that has the class."""
-        return [item for item in vars(sys.modules[type(self).__module__]).values() if isinstance(item, Statement)]
+        """Return the statements, in the order of the paper; by default those in the module of the class or a base."""
+        modules = [sys.modules[kind.__module__] for kind in type(self).__mro__]
+        found = ([item for item in vars(module).values() if isinstance(item, Statement)] for module in modules)
+        return next(filter(None, found), [])
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
         """Return in words why the settings of an experiment do not allow it to play a role, or None.

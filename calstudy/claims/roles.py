@@ -92,7 +92,11 @@ def _other_weights(experiment: Experiment) -> str | None:
 
 
 def _other_sky_model(experiment: Experiment, incomplete: bool) -> str | None:
-    """Return a refusal of the sky model if another assumption than `incomplete` sources is wrong, or None."""
+    """Return a refusal of the sky model, or None.
+
+    With `incomplete`, sources have to be missing and no other assumption may be wrong; otherwise the sky model has
+    to be that of the nominal instrument and the true sky.
+    """
     changes = assumed_changes(experiment.calibration.assumed)
     others = [path for path in changes if path not in INCOMPLETE]
     if others:

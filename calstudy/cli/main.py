@@ -161,6 +161,7 @@ def claims(
     run_code: Annotated[
         bool, typer.Option("--run-code", help="Run Python files that the folder's experiment names.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare a finished run with published statements: the measured number, its threshold, and the verdict.
 
@@ -175,7 +176,7 @@ def claims(
     """
     from calstudy.claims.evaluation import Evaluation, evaluate_folder
     from calstudy.results.reader import RunFolder
-    from calstudy.verdicts.tables import combined, show_verdicts
+    from calstudy.verdicts.tables import combined, show_verdicts, to_json
 
     console = Console(highlight=False)
     runs = [RunFolder(path) for path in (folder, *(others or ()))]
@@ -187,6 +188,9 @@ def claims(
         evaluated = Evaluation(combined(run.claims for run in runs))
     else:
         evaluated = evaluate_folder(folder, paper or (), run_code)
+    if as_json:
+        typer.echo(to_json(evaluated.verdicts))
+        return
     if evaluated.verdicts:
         show_verdicts(evaluated.verdicts, ", ".join(run.name for run in runs), console)
     for sentence in evaluated.without_role:

@@ -37,7 +37,17 @@ TWO_ARRAYS = {"minimally_redundant": "Minimally redundant", "redundant": "Redund
 
 
 class Drawing(NamedTuple):
-    """A drawn figure, the arrays that it shows (see `calstudy.plotting.style.figure_arrays`), and JSON-able notes."""
+    """A drawn figure.
+
+    Attributes
+    ----------
+    figure
+        From matplotlib.
+    shown
+        The arrays that it shows: dataclasses, mappings and sequences of them (`calstudy.plotting.style.figure_arrays`).
+    notes
+        JSON-able, kept in the record of the product.
+    """
 
     figure: Figure
     shown: Any
@@ -54,14 +64,16 @@ class StudyFigure(Plugin):
     titles
         Of a figure that compares members of a collection: their roles, from left to right, and headings. Empty: all
         members, by their names.
+    caption
+        One sentence for the report.
     variants, needs_calibration, needs_signal_loss, needs_least_squares, needs_foregrounds
         What the experiment must have: variants of the data; `residual` of calibrated data with foregrounds and effects;
         data calibrated with the EoR and without; a calibrator that fits by least squares; foregrounds.
     sections
         Sections and fields (dotted path) of the experiment that it reads; see `settings`.
-    products
-        What it shows of a run, or of each member of a family: names of its own, and functions of the graph that return
-        a task. Empty: the settings are sufficient. See `inputs`.
+    reads
+        The products that it shows of a run, or of each member of a family: functions of the graph that return a task,
+        by names of the figure's own, the keys of `job.inputs`. Empty: the settings are sufficient. See `inputs`.
     needs_injection
         True if a signal must be injected into measured data.
     shows_sky
@@ -80,7 +92,7 @@ class StudyFigure(Plugin):
     needs_least_squares: ClassVar[bool] = False
     needs_foregrounds: ClassVar[bool] = False
     sections: ClassVar[tuple[str, ...]] = ()
-    products: ClassVar[Mapping[str, Callable[[Any], Task | None]]] = {"spectra": spectra}
+    reads: ClassVar[Mapping[str, Callable[[Any], Task | None]]] = {"spectra": spectra}
     needs_injection: ClassVar[bool] = False
     shows_sky: ClassVar[bool] = True
     tolerances: ClassVar[Rules] = ()
@@ -120,12 +132,12 @@ class StudyFigure(Plugin):
         return tuple(self.titles)
 
     def inputs(self, graph: Any) -> Mapping[str, Task]:
-        """Return the tasks of `products`, by names of the figure's own, of a run or of one member of a family.
+        """Return the tasks of `reads`, by names of the figure's own, of a run or of one member of a family.
 
         The graph is a `calstudy.products.graph.Graph`, of measured data a `MeasuredGraph`. If the figure shows a single
         product of each member, its name may be empty.
         """
-        return {name: required(product(graph)) for name, product in self.products.items()}
+        return {name: required(product(graph)) for name, product in self.reads.items()}
 
     def settings(self, graph: Any) -> Mapping[str, Any]:
         """Collect further inputs from a run, or one member: by default the `sections`, by their names."""
@@ -135,10 +147,13 @@ class StudyFigure(Plugin):
     def draw(self, job: Job) -> Drawing:
         """Draw the figure.
 
-        `job.inputs` are folders of products, by the names of the method `inputs`; those of members of a family have
-        names ``name:label`` (`members_of`). `job.settings` are those of the method `settings`, and ``notes``, the
-        stand-ins. Of a family, ``layouts`` has the array layout of each member, by label, and ``members`` the settings
-        of each if there are any.
+        Parameters
+        ----------
+        job
+            Its `inputs` are folders of products, by the names of the method `inputs`; those of members of a family
+            have names ``name:label`` (`members_of`). Its `settings` are those of the method `settings`, and
+            ``notes``: the stand-ins, which are printed below the figure. Of a family, ``layouts`` has the array
+            layout of each member, by label, and ``members`` the settings of each if there are any.
         """
 
 
@@ -185,7 +200,7 @@ class CasesFigure(StudyFigure):
     """
 
     of = ("comparison",)
-    products: ClassVar = {"": score}
+    reads: ClassVar = {"": score}
     scores: ClassVar[Literal["bands", "bins"]] = "bands"
     tolerances = (
         (r".*\.flux_scale", Drawn(_of_solutions(spread_of_scale), "the flux scale of other noise")),
@@ -197,9 +212,14 @@ class CasesFigure(StudyFigure):
 
     @abstractmethod
     def draw_cases(self, cases: Mapping[str, Mapping[str, Case]], job: Job) -> Figure:
-        """Draw cases, by the labels of world and calibrator in the order of the file, without refused ones.
+        """Draw the figure.
 
-        `job.settings` has the labels, ``calibrators`` and ``worlds``.
+        Parameters
+        ----------
+        cases
+            By the labels of world and calibrator, in the order of the file; without those that a calibrator refuses.
+        job
+            Its `settings` have ``calibrators`` and ``worlds``, their labels.
         """
 
     def draw(self, job: Job) -> Drawing:

@@ -114,7 +114,7 @@ class BeamFitFigure(StudyFigure):
     kind: str = "beam-fit"
 
     caption = "Interpolations of the beam in frequency: differences of Jones components over the zenith."
-    products: ClassVar = {}
+    reads: ClassVar = {}
     sections = ("instrument",)
 
     def refusal(self, experiment: Experiment) -> str | None:
@@ -223,7 +223,7 @@ class DelayFloorFigure(StudyFigure):
 
     caption = "Delay floor of the foregrounds for every interpolation of the beam in frequency."
     needs_foregrounds = True
-    products: ClassVar = {}
+    reads: ClassVar = {}
     sections = ("instrument", "sky", "simulation", "corruption.eor_level")
 
     def refusal(self, experiment: Experiment) -> str | None:

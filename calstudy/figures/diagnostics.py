@@ -39,12 +39,22 @@ MAX_ANTENNAS = 8
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """The arrays of the figure, for one polarization; units are SI, delays and `lengths` ascending.
+    """The arrays of the figure, for one polarization.
 
-    `data`, `model` and `residual` are delay transforms after a Blackman-Harris taper, rms over integrations, (Nbls,
-    Ndelays). `gains` are those of `antennas` in the middle integration, NaN where flagged, (Nshown, Nfreqs), and
-    `errors` those of |g| and of the phase, NaN where not known, (2, Nshown, Nfreqs). `losses` are over the first of
-    each solve. The last four are those of `calstudy.realdata.quality.Quality`.
+    Attributes
+    ----------
+    delay : s, ascending, (Ndelays,)
+    lengths : baseline lengths in m, ascending, (Nbls,)
+    data, model, residual
+        Delay transform after a Blackman-Harris taper, rms over integrations, (Nbls, Ndelays); flagged samples are zero.
+    frequency : Hz, (Nfreqs,)
+    antennas : names of the antennas that are drawn, (Nshown,)
+    gains : complex, of the middle integration, NaN where flagged, (Nshown, Nfreqs)
+    errors : of |g| and, in rad, of the phase, by noise; NaN where they are not known, (2, Nshown, Nfreqs)
+    losses : loss after each step over the first loss of its own solve, one array for each solve
+    converged : true for each solve that converged, (Nsolves,)
+    chi2_antennas : names of all calibrated antennas, (Nants,)
+    chi2_by_antenna, chi2_by_channel, chi2_by_integration : as in `calstudy.realdata.quality.Quality`
     """
 
     polarization: str
@@ -82,7 +92,8 @@ def _delay_rms(cube: np.ndarray, grid: ChannelGrid) -> np.ndarray:
 def draw_diagnostics(found: Diagnostics) -> style.Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 
-    Images are decibel of amplitude relative to the peak of the data, in which flagged samples count as zero.
+    The dashed lines are the horizon |b|/c; images are decibel of amplitude relative to the peak of the data. Flagged
+    samples count as zero, which spreads over all delays. Bands are the errors of gains by noise.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 8.4)
     grid = figure.subplot_mosaic([list("dddmmmrrr"), list("pppppllll"), list("aaaaaffff"), list("xxxyyyzzz")])

@@ -207,7 +207,7 @@ class GainTolerance(StudyFigure):
     )
 
     of = ("comparison",)
-    products: ClassVar = {"": score, "law": gain_bias}
+    reads: ClassVar = {"": score, "law": gain_bias}
     caption = (
         "The rms of the real part of gain errors at which their bias is a tenth of the EoR, if nothing is calibrated: "
         "measured (points, 95 % bars; arrows: lower limits) and by the law (lines)."

@@ -160,7 +160,7 @@ class Reflections(StudyFigure):
 
     caption = "Delay transform of the true gains."
     shows_sky = False
-    products: ClassVar = {"gains": corruption.gains}
+    reads: ClassVar = {"gains": corruption.gains}
     sections = ("outputs.inspect.integration",)
 
     def draw(self, job: Job) -> Drawing:

@@ -82,7 +82,7 @@ class Layout(StudyFigure):
 
     caption = "The array."
     shows_sky = False
-    products: ClassVar = {}
+    reads: ClassVar = {}
     sections = ("instrument.layout",)
 
     def draw(self, job: Job) -> Drawing:
@@ -100,7 +100,7 @@ class Layouts(StudyFigure):
     caption = "The two arrays."
     titles = TWO_ARRAYS
     shows_sky = False
-    products: ClassVar = {}
+    reads: ClassVar = {}
 
     def draw(self, job: Job) -> Drawing:
         """Draw the arrays from left to right."""

@@ -65,7 +65,7 @@ class MemberBiasFigure(StudyFigure):
 
     kind: str = "member-bias"
     of = ("collection",)
-    products: ClassVar = {"score": score}
+    reads: ClassVar = {"score": score}
     caption = (
         "Absolute value of the bias of each member outside the wedge with 95 % bars; open symbols: 95 % upper limit "
         "where it is not above its error. The dashed line is the EoR."
@@ -97,9 +97,11 @@ ARRAYS = {
 
 @style.journal_style()
 def draw_solver_comparison(arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]]) -> style.Figure:
-    """Draw P^R, and below it P^R without EoR: a column for each array, by title, of the paper's solver and the default.
+    """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
 
-    Markers, bars and band are those of `draw_spherical`; the dotted line is 1.96 σ of the thermal noise.
+    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ; the dotted line
+    is 1.96 σ of the thermal noise. `arrays` has, by title, the spectra with the paper's solver and with the default
+    one; power in mK² h⁻³ Mpc³, k in h/Mpc.
     """
     figure = style.new_figure(style.TWO_COLUMNS, 5.6)
     figure.set_layout_engine("constrained", hspace=0.02, wspace=0.02)
@@ -147,7 +149,8 @@ def _limits(shown: Sequence[SphericalColumn], name: str) -> tuple[float, float]:
 class SolverComparison(StudyFigure):
     """P^R outside the wedge with the paper's solver and the default one, with EoR and without, of one array or both.
 
-    An array is shown if both of its roles are played, of the member with the paper's solver and with the default one.
+    The members in the roles `paper_solver` and `redundant_paper_solver` have the paper's solver, those in the roles
+    `minimally_redundant` and `redundant` the default one. An array is shown if both of its roles are played.
     """
 
     kind: str = "solver-comparison"

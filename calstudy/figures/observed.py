@@ -74,7 +74,7 @@ class ObservedSpherical(StudyFigure):
     kind: str = "observed-spherical"
 
     of = ("observed",)
-    products: ClassVar = {"spectra": observed_spectra}
+    reads: ClassVar = {"spectra": observed_spectra}
     caption = (
         "Spherical power spectra of the measured data, even x odd, with 95 % bars of the noise alone; open where "
         "negative."
@@ -103,7 +103,7 @@ class ObservedWedge(StudyFigure):
     kind: str = "observed-wedge"
 
     of = ("observed",)
-    products: ClassVar = {"spectra": observed_spectra}
+    reads: ClassVar = {"spectra": observed_spectra}
     caption = (
         "Cylindrical power spectra of the measured data: as given, calibrated, the residual, and the power of their "
         "noise from the difference of the two halves; negative values in blue."

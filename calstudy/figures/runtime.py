@@ -30,7 +30,11 @@ CLOCKS = {"cpu": "one core", "gpu": "GPU"}
 
 @dataclass(frozen=True)
 class RuntimeSeries:
-    """Run times of one solver and machine, s: median and ends of the central 95 %, (Nsizes,), and their power law."""
+    """Run times of one machine or solver: median and ends of the central 95 %, (Nsizes,), s.
+
+    `size` is the number of antennas, or the longest baseline in m, increasing; `fit` gives the medians as a power of
+    it.
+    """
 
     label: str
     size: np.ndarray

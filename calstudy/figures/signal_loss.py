@@ -113,7 +113,7 @@ class SignalLossFigure(StudyFigure):
     )
     needs_signal_loss = True
     needs_calibration = True
-    products: ClassVar = {"transfer": signal_loss.transfer}
+    reads: ClassVar = {"transfer": signal_loss.transfer}
     sections = ("power.wedge_buffer",)
     tolerances = (
         *INJECTED_RULES,
@@ -189,7 +189,7 @@ class ExpectedLossFigure(StudyFigure):
     needs_signal_loss = True
     needs_least_squares = True
     needs_calibration = True
-    products: ClassVar = {"expected": expected_loss.expected_loss, "transfer": signal_loss.transfer}
+    reads: ClassVar = {"expected": expected_loss.expected_loss, "transfer": signal_loss.transfer}
     sections = ("power.wedge_buffer",)
     tolerances = (*INJECTED_RULES, (r"expected\..*", Drawn(half, "follows from fitted gains; half of it")))
 

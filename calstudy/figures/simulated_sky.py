@@ -122,7 +122,7 @@ class SourceCountsFigure(StudyFigure):
 
     caption = "Differential source counts at 200 MHz, and their ratio to those of Franzen et al. (2019)."
     needs_foregrounds = True
-    products: ClassVar = {}
+    reads: ClassVar = {}
     sections = ("sky", "instrument")
 
     def draw(self, job: Job) -> Drawing:
@@ -290,7 +290,7 @@ class SimulatedComponentsFigure(StudyFigure):
 
     caption = "Simulated components alone: wedge of F, P(k) of S over its input, and delay spectra of three baselines."
     needs_foregrounds = True
-    products: ClassVar = {"foregrounds": simulation.foregrounds, "eor": simulation.eor}
+    reads: ClassVar = {"foregrounds": simulation.foregrounds, "eor": simulation.eor}
     sections = ("instrument", "sky", "corruption", "power")
 
     def draw(self, job: Job) -> Drawing:

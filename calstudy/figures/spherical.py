@@ -32,7 +32,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SphericalColumn:
-    """The spherical spectra of one column, one array and choice of Fourier modes: P^S, and those of `MARKINGS`."""
+    """The spherical spectra of one column: one array, one choice of Fourier modes.
+
+    `eor` is P^S with the sample variance as its error (the grey band), `uncorrupted` P^{S+F+N} with perfect gains,
+    `uncalibrated` P^V with gain errors, `residual` P^R, `residual_without_eor` P^R of a simulation of foregrounds and
+    noise only, and `noise` P^N.
+    """
 
     title: str
     eor: SphericalSpectrum
@@ -82,11 +87,13 @@ LIMIT_MARKERS = ("v", "1", "$\\downarrow$", "P", "X", "*")
 def draw_spherical(
     columns: Sequence[SphericalColumn], limits: Sequence[Limits] = (), z: float = math.nan
 ) -> style.Figure:
-    """Draw one or two columns of spherical power spectra: full range above, signal and residuals enlarged below.
+    """Draw spherical power spectra: full range above, signal and residuals enlarged below.
 
-    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ), the grey band is P^S ± 1.96 σ. Published
-    limits are drawn above only, with the redshift `z` of the spectra. Raises ValueError for a spectrum without any
-    power, or a power without an error bar.
+    Markers are at |P|, open where P is negative; bars are 95 % (1.96 σ); the grey band is P^S ± 1.96 σ. There are one
+    or two columns, from left to right: all modes and wedge excised (Fig. SPHERICAL), or wedge excised alone (Fig.
+    SPHERICAL_LOW_SNR). Power is in mK² h⁻³ Mpc³. Published limits are drawn above only; `z` is the redshift of the
+    spectra, which is shown beside theirs. Raise ValueError for a spectrum without any power, or a power without an
+    error bar.
     """
     for column in columns:
         _check(column)
@@ -271,7 +278,7 @@ class Spherical(StudyFigure):
         return f"{self.caption} {dotted} {'; '.join(sources)}."
 
     def draw(self, job: Job) -> Drawing:
-        """Draw a column for each choice of modes, with the limits."""
+        """Draw a column for each choice of modes."""
         outside = f"outside wedge + {1e9 * job.settings['wedge_buffer']:.0f} ns"
         titles = {"all-modes": "all modes", "outside-wedge": outside}
         folder, z = job.inputs["spectra"], job.settings.get("redshift", math.nan)

@@ -101,7 +101,7 @@ class Sweep(StudyFigure):
 
     of = ("sweep",)
     caption = "Signal loss outside the wedge against what was varied, in bands of k, with 95 % bars."
-    products: ClassVar = {"": signal_loss.transfer}
+    reads: ClassVar = {"": signal_loss.transfer}
 
     def draw(self, job: Job) -> Drawing:
         """Draw T against the varied fields."""

@@ -153,7 +153,7 @@ class UnbiasedFigure(StudyFigure):
 
     kind: str = "unbiased"
     of = ("experiment", "comparison")
-    products: ClassVar = {"": unbiased}
+    reads: ClassVar = {"": unbiased}
     caption = (
         "Power spectrum of the residual outside the wedge as measured, and deconvolved with the window functions of "
         "the calibration, beside the EoR, with 95 % bars; open symbols: negative."
@@ -169,8 +169,10 @@ class UnbiasedFigure(StudyFigure):
 
     def refusal(self, experiment: Experiment) -> str | None:
         """Return why the figure cannot be drawn of an experiment, to follow its name, or None."""
-        reason, lacking = super().refusal(experiment), why_not(experiment)
-        return reason or (f"needs {lacking}" if lacking else None)
+        if reason := super().refusal(experiment):
+            return reason
+        lacking = why_not(experiment)
+        return f"needs {lacking}" if lacking else None
 
     def draw(self, job: Job) -> Drawing:
         """Draw one spectrum, or the means over the realizations of every calibrator and kind of signal."""

@@ -50,13 +50,14 @@ def make_beams(settings: InstrumentSettings, n_antennas: int) -> AntennaBeam | A
 def _make(distinct: list[AssignedBeam], settings: InstrumentSettings) -> list[AntennaBeam]:
     models = nominal_beams(settings)
     made: dict[tuple, Beam] = {}
-    for model, amplitudes in dict.fromkeys((beam.model, beam.amplitudes) for beam in distinct):
-        section = models[model]
-        if amplitudes is None:
+    for model in dict.fromkeys(beam.model for beam in distinct):
+        section, members = models[model], dict.fromkeys(beam.amplitudes for beam in distinct if beam.model == model)
+        if None in members:
             made[model, None] = make_beam(section, settings.channels)
-        else:
+        if tiles := [amplitudes for amplitudes in members if amplitudes is not None]:
             with guarded(section):
-                (made[model, amplitudes],) = model_of(section).make_tiles(settings.channels, np.array([amplitudes]))
+                tile_beams = model_of(section).make_tiles(settings.channels, np.array(tiles))
+            made |= {(model, amplitudes): beam for amplitudes, beam in zip(tiles, tile_beams, strict=True)}
     nominal = Misalignment()
     found = [((beam.model, beam.amplitudes), beam.misalignment) for beam in distinct]
     counts = Counter(key for key, error in found if error != nominal)

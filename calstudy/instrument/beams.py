@@ -96,7 +96,7 @@ class ExactBeam:
         self.name, self.stand_in, self._analytic = name, stand_in, analytic
         if isinstance(analytic, UnpolarizedAnalyticBeam):
             self._analytic = FeedBeam(formula=analytic, feed_array=analytic.feed_array, feed_angle=analytic.feed_angle)
-        self._angles = lru_cache(maxsize=None)(self._solid_angles)
+        self._angles: dict[tuple[int, bytes], np.ndarray] = {}
 
     def at(self, frequencies: np.ndarray) -> AnalyticBeam:
         """Return the analytic E-field beam, which is valid at any frequency (Hz)."""
@@ -104,10 +104,14 @@ class ExactBeam:
 
     def solid_angles(self, frequencies: np.ndarray, polarization: str) -> tuple[np.ndarray, np.ndarray]:
         """Return Ω_p and Ω_pp in sr, (Nfreqs,) each; see `Beam`."""
-        first, second = self._angles(tuple(np.asarray(frequencies, dtype=float)), FEEDS[polarization]).copy()
+        wanted = np.asarray(frequencies, dtype=float)
+        key = FEEDS[polarization], wanted.tobytes()
+        if key not in self._angles:
+            self._angles[key] = self._solid_angles(wanted, key[0])
+        first, second = self._angles[key].copy()
         return first, second
 
-    def _solid_angles(self, frequencies: tuple[float, ...], feed: int) -> np.ndarray:
+    def _solid_angles(self, frequencies: np.ndarray, feed: int) -> np.ndarray:
         """Return Ω_p and Ω_pp, (2, Nfreqs), from a grid if it resolves the beam at all frequencies."""
         angles = []
         for frequency in frequencies:
@@ -115,7 +119,7 @@ class ExactBeam:
             found, coarse = (integrate_power(power[::n], ZENITH_ANGLES[::n]) for n in (1, 2))
             # Also false for a beam so narrow that both are zero.
             if not (np.abs(found - coarse) < RESOLVED * found).all():
-                return self._adaptive_solid_angles(np.array(frequencies), feed)
+                return self._adaptive_solid_angles(frequencies, feed)
             angles.append(found)
         return np.array(angles).T
 

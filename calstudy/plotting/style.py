@@ -94,7 +94,11 @@ _LOCK = RLock()
 
 @contextmanager
 def journal_style() -> Iterator[None]:
-    """Draw or save with the settings of this module, not the user's, one thread after the other; also a decorator."""
+    """Draw or save with the settings of this module, regardless of the user's; also a decorator.
+
+    Matplotlib's settings are global to the process: they are restored on exit, and a lock keeps two threads of a study
+    from drawing at once.
+    """
     import matplotlib.style
 
     with _LOCK, matplotlib.style.context(["default", _PARAMETERS]):
@@ -139,7 +143,11 @@ def entry(**look: Any) -> Line2D:
 
 
 def note_stand_ins(figure: Figure, stand_ins: Sequence[str]) -> None:
-    """Print what stands in for the paper's inputs, sentences or phrases, in small grey letters below the axes."""
+    """Print the substitutes for the paper's inputs as one small grey line below the axes, and return the text.
+
+    Each is a sentence or phrase, such as ``"synthetic faint sources"``. Without any, nothing is printed, and None is
+    returned.
+    """
     if not stand_ins:
         return
     text = "stand-in: " + "; ".join(item.strip().rstrip(".") for item in stand_ins)
@@ -157,8 +165,8 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 def figure_arrays(data: Any, path: str = "") -> dict[str, np.ndarray]:
     """Return every array of nested dataclasses, mappings and sequences by its path, ``"excised.residual.power"``.
 
-    `path` is that of the data themselves. None means absent; raises ValueError for other values than arrays, numbers
-    and strings. A field of a dataclass may have another name there, under ``array`` in its metadata.
+    None means absent; raises ValueError for other values than arrays, numbers and strings. A field of a dataclass may
+    have another name there, under ``array`` in its metadata, so that published arrays keep their names.
     """
     if data is None:
         return {}
@@ -185,8 +193,9 @@ def _plain_array(name: str, value: Any) -> np.ndarray:
 def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Path | str, name: str) -> list[Path]:
     """Write ``name.npz``, ``name.pdf`` and ``name.png`` (200 dpi) into `directory`, and return the three paths.
 
-    Each file is written completely or not at all. The same figure and arrays give the same bytes, without dates.
-    Raises ValueError if the name is no file name or an array not plain, and OSError if it cannot be written.
+    Each file is written completely or not at all, and replaces an older one. The same figure and arrays give the same
+    bytes: no dates are written. Raises ValueError if the name has other characters than letters, digits, ``.``, ``_``
+    and ``-``, or an array (`figure_arrays`) is not plain, and OSError if the directory cannot be made or written.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"figure name '{name}' is not a file name: use letters, digits, '.', '_' and '-'")
@@ -199,12 +208,15 @@ def save_figure(figure: Figure, arrays: Mapping[str, np.ndarray], directory: Pat
         "png": partial(figure.savefig, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}),
     }
     paths = [folder / f"{name}.{ending}" for ending in writers]
+    layout = figure.get_layout_engine() if figure.axes else None
     with journal_style():
-        if figure.axes and (layout := figure.get_layout_engine()) is not None:
+        if layout is not None:
             # Matplotlib would lay it out again for each file.
             layout.execute(figure)
             figure.set_layout_engine(None)
         for path, write in zip(paths, writers.values(), strict=True):
             with replacing(path) as stream:
                 write(stream)
+    if layout is not None:
+        figure.set_layout_engine(layout)
     return paths

@@ -37,7 +37,11 @@ HEADLINE_BAND = (0.2, 0.5)
 
 @dataclass(frozen=True)
 class CalibratedSpectra(Injection):
-    """Delay spectra of an injected EoR, and of the calibrated residual of data with it and without."""
+    """Delay spectra of the same units and delays.
+
+    `signal` is of the EoR alone, `response` of the change of the residual by the EoR, and `cross` of the EoR times this
+    change; `residual` and `residual_without_eor` are of the calibrated residual of data with and without the EoR.
+    """
 
     residual: DelaySpectra
     residual_without_eor: DelaySpectra

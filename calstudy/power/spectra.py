@@ -207,7 +207,17 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class CylindricalSpectrum(Cylinder):
-    """A power spectrum, the mean over the `n_pairs` pairs of baselines in each bin, (Nb, Nd) complex."""
+    """A power spectrum in Nb bins of baseline length and Nd delays.
+
+    Attributes
+    ----------
+    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges : lower and upper edge of each bin, (Nb, 2), m
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc; from zero up if folded
+    power : mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k)
+    n_pairs : pairs of baselines averaged, (Nb,) int
+    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
+    """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
     n_pairs: np.ndarray = field(metadata={"unit": ""})
@@ -380,7 +390,7 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
 
 
 def _antenna_shares(uvp: UVPSpec, pairs: np.ndarray, unit: np.ndarray) -> dict[str, Any]:
-    """Return the shares of `DelaySpectra`, powers as means over polarizations."""
+    """Return unit, antenna, number of pairs and summed power (mean over polarizations) of `DelaySpectra`'s shares."""
     numbers = {int(code): uvp.bl_to_antnums(int(code)) for code in np.unique(pairs)}
     antennas = np.array([[*numbers[first], *numbers[second]] for first, second in pairs.tolist()])
     # A pair counts once for an antenna that both of its baselines have.

@@ -164,7 +164,17 @@ RATIOS = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherenc
 
 @dataclass(frozen=True)
 class TransferMap(Cylinder):
-    """T and C as in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples."""
+    """T and C in Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
+
+    Attributes
+    ----------
+    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
+    bin_edges : lower and upper edge of each bin, (Nb, 2), m
+    delay, k_parallel : (Nd,) ascending, s and h/Mpc
+    transfer, transfer_error, cross_transfer, cross_transfer_error
+        As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
+    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
+    """
 
     transfer: np.ndarray = field(metadata={"unit": ""})
     transfer_error: np.ndarray = field(metadata={"unit": ""})
@@ -348,7 +358,7 @@ def correct(spectrum: SphericalSpectrum, transfer: TransferFunction, reduced: bo
     Errors of P^R and T are independent. Those of P^R are divided by T if they are `reduced` like P^R, as errors of
     what is left in measured data. Those of simulations are of all noise and EoR, of which the calibration takes as much
     as of the signal: dividing P^R by T restores both. NaN where too little is left to be corrected, or where most
-    of it is not the EoR at this k (`correctable`). Bins are the same.
+    of it is not the EoR at this k (`correctable`). Both must have the same bins.
     """
     known = correctable(
         transfer.transfer, transfer.transfer_error, transfer.cross_transfer, transfer.cross_transfer_error

@@ -26,7 +26,10 @@ MOST_SAMPLES = 112 * 630 * 384
 
 @memoize
 def agreement(graph: Graph) -> Task | None:
-    """Return the task, or None without a calibrated variant `residual` with effects, or without one of noise alone."""
+    """Return the task that compares the calibration of variant `residual` with the truth, or None if there is none.
+
+    It needs a calibrated variant `residual` of foregrounds and noise with effects, and a variant of noise alone.
+    """
     variants, foregrounds = graph.experiment.variants, simulation.foregrounds(graph)
     residual, noise = variants.get("residual"), variants.get("noise")
     if foregrounds is None or residual is None or noise is None or noise.components != ("noise",):

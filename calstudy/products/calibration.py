@@ -130,7 +130,11 @@ def read_result(folder: Path) -> CalibrationResult:
 
 
 class Calibrated(Task):
-    """What is made of data that are calibrated; autocorrelations are apart if only the calibrator needs them."""
+    """What is made of data that are calibrated.
+
+    There may be a sky model, the level of the noise if the calibrator needs it, and the autocorrelations if it needs
+    them and the data have none.
+    """
 
     data: Input
     sky_model: Input = None

@@ -30,7 +30,10 @@ PATHS = "convergence.json"
 
 
 def followed(graph: Graph, name: str, solver: Solver, integration: int) -> Task:
-    """Return the task that follows a solver, in place of the experiment's own, on one integration of a variant."""
+    """Return the task that follows a solver, in place of the experiment's own, on one integration of a variant.
+
+    Both realizations are solved; integrations are counted from 0.
+    """
     experiment = graph.experiment
     variant = experiment.variants[name]
     noise = Variant(components=("noise",))
@@ -63,7 +66,10 @@ class Convergence(Task, stage="convergence", version=4):
     sky_model: Input = None
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Solve, and write the power outside the wedge that both have in common after numbers of steps, by baseline."""
+        """Solve, and write the power that the realizations have in common after numbers of steps.
+
+        Powers are sums over the delays outside the wedge, one per baseline, of the first polarization.
+        """
         paths, realizations = {}, {}
         for parity in PARITIES:
             realizations[parity], paths[parity], baselines = self._solved(parity)

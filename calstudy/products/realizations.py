@@ -444,7 +444,7 @@ def _loss_table(results: RegionResults, blocks: Sequence[Mapping[str, Any]]) -> 
                 "scatter over quoted": _cell(Finding(ratio, error)),
             }
         )
-    return Table.of_records(rows)
+    return Table.of_records(rows, "k [h/Mpc]")
 
 
 def _power_table(results: RegionResults) -> Table:
@@ -458,7 +458,7 @@ def _power_table(results: RegionResults) -> Table:
         row["bars that cover P^S"] = _percent(results.coverage("eor", bins))
         row["the input"] = _percent(results.coverage("input", bins))
         rows.append(row)
-    return Table.of_records(rows)
+    return Table.of_records(rows, "k [h/Mpc]")
 
 
 def _corrected_table(results: RegionResults) -> Table:
@@ -475,7 +475,7 @@ def _corrected_table(results: RegionResults) -> Table:
                 "bins corrected": f"{known.sum()} of {known.size}",
             }
         )
-    return Table.of_records(rows)
+    return Table.of_records(rows, "k [h/Mpc]")
 
 
 def _of_other_realizations(corrected: Corrected) -> str:

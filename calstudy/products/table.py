@@ -18,9 +18,15 @@ from calstudy.run.task import Inputs, Job, Task
 class StudyTable(Plugin):
     """The base of all tables. A built-in one has `products`; one's own has `inputs` and `rows`.
 
-    `of` is the kind of study that has the table, a module of `calstudy.studies.kinds`. A module of this package in
-    which it is written down has a table of every such study, in the order of `place`; others are asked for in
-    ``outputs.tables``. The title, in the report, is its name if empty.
+    Attributes
+    ----------
+    of
+        The kind of study that has the table, a module of `calstudy.studies.kinds`. A module of this package in which it
+        is written down has a table of every such study; others are asked for in ``outputs.tables``.
+    place
+        Among the tables of a study; those of a user's own come last.
+    title, note
+        Of the table in the report; the title is its name if empty.
     """
 
     registry: ClassVar = TABLES
@@ -53,7 +59,13 @@ class StudyTable(Plugin):
         return {}
 
     def rows(self, job: Job) -> Iterable[Mapping[str, Any]]:
-        """Return the rows, each by the names of columns, from the folders of `inputs` and from `settings`."""
+        """Return the rows, each by the names of columns.
+
+        Parameters
+        ----------
+        job
+            Its `inputs` are the folders of the method `inputs`, its `settings` those of the method `settings`.
+        """
         raise NotImplementedError
 
 

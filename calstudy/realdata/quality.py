@@ -55,11 +55,16 @@ NEIGHBOURS = 1.5
 class Quality:
     """Gains and chi^2 of one polarization. NaN where everything is flagged.
 
-    `antennas`, (Nants,), are the names of those with solutions, and `frequency` is in Hz, (Nfreqs,). `gain_by_channel`,
-    (Nants, Nfreqs), is |g| over the antenna's median, of the median integration; `gain_by_antenna` that median over
-    that of all antennas; and `data_by_channel` |V| over that of the median channel, the median over baselines and
-    integrations. chi^2 is the mean of |V - g g* F|^2 / sigma^2 over unflagged samples. Parameters of the fit are not
-    counted, so that it is slightly below one for noise. `noise` is the source of sigma, in words.
+    Attributes
+    ----------
+    antennas, frequency : names of the antennas with solutions, (Nants,), and channels in Hz, (Nfreqs,)
+    gain_by_channel : |g| over the antenna's median, median over integrations, (Nants, Nfreqs)
+    gain_by_antenna : median |g| of each antenna over the median of all antennas, (Nants,)
+    data_by_channel : |V| over that of the median channel, median over baselines and integrations, (Nfreqs,)
+    chi2_by_antenna, chi2_by_channel, chi2_by_integration
+        Mean of |V - g g* F|^2 / sigma^2 over unflagged samples, (Nants,), (Nfreqs,), (Ntimes,). Parameters of the fit
+        are not counted, so that it is slightly below one for noise.
+    noise : the source of sigma, in words
     """
 
     polarization: str

@@ -31,7 +31,12 @@ class Number:
 
 @dataclass(frozen=True)
 class Signal:
-    """The scores of a run in the band of the headline, and T of the linear response of the fit, None if not known."""
+    """EoR and other power that is left outside the wedge, in the band of the headline.
+
+    The transfer is the fraction of the EoR's power that is left; the bias is the power of the residual without EoR
+    over that of the EoR. Both are free of the flux scale of the calibrated data, and are the scores of the run, with
+    errors from leaving out antennas.
+    """
 
     transfer: float
     transfer_error: float

@@ -46,14 +46,21 @@ NUMBER = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves over k, or maps over k_perp and k_parallel, as `data` for the page's script, ready for JSON."""
+    """Curves over k, or maps over k_perp and k_parallel.
+
+    `data` is the input of the page's script: `kind`, labels and series, ready for JSON.
+    """
 
     title: str
     data: Mapping[str, Any]
 
 
 def read_charts(path: Path) -> list[Chart]:
-    """Return the charts of the arrays of a figure, ``NAME.npz``; none for other arrays than spectra and T."""
+    """Return the charts of the arrays of a figure (``NAME.npz`` from `calstudy.plotting.style`); none for other arrays.
+
+    An entry ``GROUP.FIELD`` is a field of a spectrum: `power` over `k`, a transfer function over `k`, or either over
+    `k_perp` and `k_parallel`. Items of lists, which have numbers for names, are left out.
+    """
     groups: dict[str, dict[str, np.ndarray]] = {}
     for name, values in arrays_of_figure(path).items():
         group, _, field = name.rpartition(".")
@@ -156,9 +163,10 @@ class Picture:
 class Contents:
     """All contents of a report.
 
-    Facts are short statements by name, such as the time, the machine and versions; answers say which calibrators of a
-    comparison pass. Files, and the reports of parts by name, are relative to the run folder. The experiment is the
-    resolved file, or empty.
+    Facts are short statements by name, such as the time, the machine and versions. Answers say which calibrators of a
+    comparison pass. Pictures and tables are in the order of the page, below the headline. Files, tables and records,
+    are relative to the run folder. Parts are the run folders of which this one consists: name and relative path of
+    their reports. The experiment is the resolved file, or empty.
     """
 
     title: str
@@ -347,7 +355,10 @@ def page_of(template: str, **values: Any) -> str:
 
 
 def write_report(folder: Path) -> Path:
-    """Write report.html into the folder of a finished run, and return its path; raises InputError for other folders."""
+    """Write report.html into the folder of a finished run, completely or not at all, and return its path.
+
+    Raises InputError for other folders.
+    """
     return write_page(page_of("page.html", contents=read_contents(RunFolder(folder))), folder / REPORT)
 
 
@@ -367,9 +378,11 @@ MOST = len(COLOURS) - 1
 
 @dataclass(frozen=True)
 class Several:
-    """Some runs, by the names of theirs or of their folders, and their common contents.
+    """Some runs, and their common contents.
 
-    Claims are None if no run has any, and a picture or table where a run lacks it.
+    Names are those of the runs, or of their folders if two runs have one name. Differences are the fields of the
+    experiments that differ. Claims, the papers' statements with the verdicts on all, are None if no run has any. A
+    picture or table is None where a run lacks it.
     """
 
     contents: Sequence[Contents]
@@ -468,7 +481,7 @@ def _claims(found: Sequence[Table | None], names: Sequence[str]) -> Table | None
 
 
 def write_several(folders: Sequence[Path], output: Path, overwrite: bool = False) -> Path:
-    """Write the page of several runs, and return its path.
+    """Write the page of several runs, completely or not at all, and return its path.
 
     Raises InputError if a folder is not that of a finished run, or the file exists and `overwrite` is false.
     """

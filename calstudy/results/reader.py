@@ -193,7 +193,10 @@ COORDINATES = ("k", "baseline_length", "k_perp", *OF_DELAY, "horizon_delay")
 
 
 def by_wavenumber(spectrum: SphericalSpectrum | TransferFunction | Score) -> xarray.Dataset:
-    """Return quantities in bins of |k|, with coordinates `k`, `k_from` and `k_to`, h/Mpc, and numbers as attributes."""
+    """Return quantities in bins of |k| with the coordinates `k`, `k_from` and `k_to`, h/Mpc.
+
+    Numbers that hold for all bins, such as the flux scale, are attributes.
+    """
     arrays = {item.name: (("k",), getattr(spectrum, item.name)) for item in _arrays(spectrum)}
     edges = spectrum.bin_edges
     arrays |= {"k_from": (("k",), edges[:-1]), "k_to": (("k",), edges[1:])}
@@ -271,7 +274,10 @@ def arrays_of_figure(path: Path) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """The folder of a finished run, or of a reference; its properties raise InputError if a file is damaged."""
+    """The folder of a finished run, or of a reference, whose figures are beside its manifest.
+
+    Every property reads its file when it is first used, and raises InputError if the file is damaged.
+    """
 
     path: Path
 
@@ -407,7 +413,10 @@ def find_runs(folder: Path) -> list[RunFolder]:
 
 
 def keys_of_runs(folder: Path) -> set[str]:
-    """Return the keys of the products of all runs in a folder and below; raises InputError if any cannot be read."""
+    """Return the keys of the products of all runs in a folder and its subfolders.
+
+    Raises InputError without a folder, and for a folder, or the manifest of a run, that cannot be read.
+    """
 
     def stop(error: OSError) -> NoReturn:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror}), and may hold runs")
@@ -427,7 +436,10 @@ def keys_of_runs(folder: Path) -> set[str]:
 
 
 def _runs_in(folder: Path, on_error: Callable[[OSError], None] | None = None) -> list[RunFolder]:
-    """Return all runs in a folder and its subfolders, which may be links; see `os.walk` for `on_error`."""
+    """Return all runs in a folder and its subfolders, which may be links; a folder that is found twice counts once.
+
+    `on_error` is called with the error of a folder that cannot be read; by default it is left out.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of runs")
     found, seen = [], set()

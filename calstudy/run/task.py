@@ -81,7 +81,10 @@ class Task(Declared, ABC):
 
     @abstractmethod
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the files of the product to an empty folder, and return JSON-able notes; slow libraries are inside."""
+        """Write the files of the product to an empty folder, and return JSON-able notes about it.
+
+        Slow libraries are imported inside, because plans are made without them.
+        """
 
     def shown(self, folder: Path) -> Sequence[Table]:
         """Return the tables by which a report shows the product that is in a folder."""

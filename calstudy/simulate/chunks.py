@@ -134,12 +134,20 @@ def check_interpolation(
     channels: slice = slice(None),
     count: int = 3,
 ) -> dict[str, Any]:
-    """Compare interpolated visibilities, (Ntimes, Nbls, Nfreqs, Npols), with direct ones where the error is largest.
+    """Compare interpolated visibilities with a direct simulation where the error should be largest.
 
-    These are of all combinations of `count` integrations and channels, spread over the observation and each as far from
-    the nodes of `chunk` as possible, of the `channels` that the sky has. `simulate` gives the visibilities of a
-    template. Errors, the largest and the rms, are relative to the rms of the visibilities. They are returned with the
-    times (Julian dates), the channels (Hz) and the numbers of nodes, as plain JSON types.
+    Errors, the largest and the rms, are relative to the rms of the visibilities, and of all combinations of a few
+    integrations (Julian dates) and channels (Hz). They are returned with the numbers of nodes, as plain JSON types.
+
+    Parameters
+    ----------
+    simulate
+        Returns the visibilities at the integrations and channels of a template, (Ntimes, Nbls, Nfreqs, Npols): an
+        engine's `simulate` with the sky and beam of the simulation.
+    cube : interpolated visibilities at all channels, (Ntimes, Nbls, Nfreqs, Npols)
+    chunk : any chunk of the simulation, for its nodes
+    channels : channels to choose from: those of the sky, if it is given channel by channel
+    count : number of integrations, and of channels, spread over the observation; each is as far from nodes as possible
     """
     times, frequencies = integration_times(template), template.freq_array
     nodes = time_axis(template, chunk.accuracy).nodes

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.signal import get_window
 
 from calstudy.base.visibilities import baseline_vectors, to_cube
 from calstudy.power.delay import horizon_delay
@@ -53,6 +52,8 @@ def delay_profile(foregrounds: UVData, taper: Taper) -> tuple[np.ndarray, np.nda
     """
     cube = to_cube(foregrounds)
     width = float(np.diff(foregrounds.freq_array).mean())
+    from scipy.signal import get_window
+
     window = get_window(WINDOWS[taper], cube.shape[2], fftbins=False)
     spectrum = np.fft.fft(cube * window[:, None], axis=2)
     return np.fft.fftfreq(cube.shape[2], width), np.mean(np.abs(spectrum) ** 2, axis=(0, 3))

@@ -24,11 +24,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SimulationSize:
-    """Numbers of components of the sky, above and below the horizon, of antennas, and of distinct beams.
+    """Size of a simulation, from which an engine estimates its cost.
 
-    `slots` is the number of combinations of time and frequency nodes, `patch_slots` that of each patch of neighbouring
-    sources (`calstudy.simulate.patches`). `regular` antennas are on a flat lattice; without interpolation `tolerance`
-    is 0.
+    Attributes
+    ----------
+    sources : number of components of the sky, above and below the horizon
+    slots : number of combinations of time and frequency nodes
+    patch_slots : the same for each patch of neighbouring sources (`calstudy.simulate.patches`)
+    beams : number of distinct beams
+    tolerance : tolerance of the interpolation, 0 for none
+    regular : whether the antennas are on a flat lattice
     """
 
     sources: float

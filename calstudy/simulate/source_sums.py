@@ -55,10 +55,16 @@ TAYLOR: dict[type, tuple[tuple, tuple]] = {np.float64: _taylor(np.float64, 12), 
 
 @dataclass(frozen=True)
 class PairSums:
-    """Visibilities of all baselines at `frequencies` (Hz, ascending), summed over sources in a precision `dtype`.
+    """Visibilities of all baselines of an array, summed over sources.
 
-    `delays` are the positions of the antennas over the speed of light, s, in east, north, up, (Nants, 3), `pairs` the
-    first and the second antenna of each baseline, (Nbls,) each, and `index` is that of the pattern of each antenna.
+    Attributes
+    ----------
+    delays : positions of the antennas over the speed of light, s, in east, north, up, (Nants, 3)
+    pairs : first and second antenna of each baseline, two arrays (Nbls,) int
+    frequencies : in Hz, ascending, (Nfreqs,)
+    patterns : distinct beams at these frequencies
+    index : index of the beam of each antenna, (Nants,) int
+    dtype : precision of the products, float64 or float32
     """
 
     delays: np.ndarray

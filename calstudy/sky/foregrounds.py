@@ -209,6 +209,8 @@ def _make(settings: section.Foregrounds, frequencies: np.ndarray) -> Foregrounds
 
 def _gleam(settings: section.GleamSources) -> Foregrounds:
     path = section.find_gleam() if settings.path is None else settings.path
+    if not path.is_file():
+        raise InputError(f"sky.foregrounds.path: there is no file {path}; 'calstudy data fetch gleam' downloads it")
     verify_gleam(path)
     catalogue = read_gleam_table(path)
     stand_in = None

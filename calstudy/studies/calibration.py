@@ -241,7 +241,10 @@ class DataCalibration(DataStudy):
         )
 
     def read(self) -> list[str]:
-        """Read all input files; return sentences on what is done to the data, and on doubts; raises InputError."""
+        """Read all input files without calibrating; return sentences on what is done to the data, and on doubts.
+
+        Raises InputError if a file cannot be used.
+        """
         from calstudy.calibrate.preparation import starting_gains
         from calstudy.calibrate.weights import conspicuous, make_weights
 

@@ -26,6 +26,7 @@ from calstudy.power.interface import require_antennas, require_modes
 from calstudy.products.corruption import PARITIES, data
 from calstudy.products.graph import Graph
 from calstudy.products.sky_model import sky_model
+from calstudy.simulate.settings import SimulationSettings
 from calstudy.sky.counts import expected_sources
 from calstudy.sky.settings import Eor, FileSources, Foregrounds, GleamSources, PointSources, SyntheticSources
 
@@ -138,7 +139,7 @@ def _require_small_errors(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    found = (_needless_limit, _average, _distant_box, _coarse_maps)
+    found = (_needless_limit, _average, _needless_chunks, _needless_pieces, _distant_box, _coarse_maps)
     return tuple(note for note in (note(experiment) for note in found) if note)
 
 
@@ -161,6 +162,21 @@ def _require_another_sky(experiment: Experiment) -> None:
     needless = _needless_limit(experiment)
     if needless and len(assumed_changes(experiment.calibration.assumed)) == 1:
         raise InputError(f"{needless}; give a higher limit, or a smaller {FIELD}.sky.foregrounds.count")
+
+
+def _needless_chunks(experiment: Experiment) -> str:
+    chunks, channels = experiment.simulation.chunks, experiment.instrument.channels.count
+    if chunks <= max(channels, SimulationSettings().chunks):
+        return ""
+    return f"simulation.chunks = {chunks}: the EoR is simulated in {channels} parts, for there are no more channels"
+
+
+def _needless_pieces(experiment: Experiment) -> str:
+    settings, times = experiment.calibration, experiment.instrument.times.count
+    solves = math.ceil(times / settings.integrations_per_solve)
+    if settings.chunks <= max(solves, type(settings).model_fields["chunks"].default):
+        return ""
+    return f"calibration.chunks = {settings.chunks}: there are {solves} pieces, one for each solve"
 
 
 def _average(experiment: Experiment) -> str:

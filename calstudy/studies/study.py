@@ -47,7 +47,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunProducts:
-    """Products that were made or looked up, and those behind them that are in the store, by key; `tasks` were made."""
+    """Products of a study.
+
+    `products`, by key, are those that were made or looked up, and all others behind them that are still in the
+    store. `tasks` are those whose products were made; the others were in the store.
+    """
 
     products: Mapping[str, Product]
     tasks: tuple[Task, ...]
@@ -61,7 +65,10 @@ class RunProducts:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, products, all tasks whose products it made or looked up, and runs of its parts."""
+    """A finished run: its folder, its products, all tasks whose products it made or looked up, and runs of its parts.
+
+    The folder contains the resolved file, the manifest, the log, figures and tables; parts have their own, by name.
+    """
 
     folder: Path
     made: RunProducts
@@ -90,9 +97,17 @@ class Study(ABC):
     """The content of a file: an experiment, a family of experiments, measured data, run times.
 
     A kind of study is a subclass in a file of its own: a module of `calstudy.studies.kinds`, or a file or an
-    installed package that the key `study` of a file names. Files of a built-in kind are marked by its `key`; the
-    reference of all fields has its heading and guide. With `keeps_tables`, the manifest lists the files of the tables
-    with digests, so that a collection can take them from there; with `has_reference`, `calstudy regress` makes it.
+    installed package that the key `study` of a file names.
+
+    Attributes
+    ----------
+    key : the key that marks a file of a built-in kind
+    model : the content of a file
+    heading, guide : of the kind in the reference of all fields, and what is written there about its files
+    subfolders : folders in the run folder besides figures and tables
+    keeps_tables
+        True if the manifest lists the files of the tables with digests, so that a collection can take them from there.
+    has_reference : true if figures and claims of a run may be a reference for `calstudy regress`
     """
 
     key: ClassVar[str] = ""
@@ -282,8 +297,8 @@ def make(
 ) -> RunProducts:
     """Make the products that are missing in the store with all their inputs, and report the progress.
 
-    A read-only store is sufficient if nothing is missing. Raises InputError if the store must be written and cannot be,
-    or a stage refuses its input.
+    A read-only store is sufficient if nothing is missing. With `strict`, products of other code or other package
+    versions are made again. Raises InputError if the store must be written and cannot be, or a stage refuses its input.
     """
     lease, keys = Lease(store), {task.key for task in targets}
     is_complete = len(found_of(targets, store)) == len(keys) and not without_record(targets, store)
@@ -337,7 +352,8 @@ def said_of_other_code(targets: Sequence[Task], plan: Schedule, store: Store) ->
 def run_study(study: Study, budget: Budget | None = None, console: Console | None = None) -> Run:
     """Make all products of a study that are missing in the store, and fill its run folder; without console, silently.
 
-    Raises InputError as `make`, and if the study does not fit the machine or a run folder cannot be written.
+    Raises InputError if the study does not fit the machine, the store or a run folder cannot be written, or a stage
+    refuses its input.
     """
     budget, console = budget or Budget(), console or Console(quiet=True)
     study, count = study.sized_to(budget)

@@ -108,10 +108,13 @@ class StepInput(Tables):
 class Step(Plugin):
     """Base class of the steps; fields of subclasses are parameters of their measurements.
 
-    `proves` says what in words; `number` is its place in the ladder, such as "2.1". `experiments` are those on whose
-    products it measures, by name, and `sections` those of them that the measurement itself reads, not those that only
-    affect products. `parameters` are the values of the fields, and `small_parameters` others at small scale. `limits`
-    are the conditions on its numbers, by name.
+    Attributes
+    ----------
+    number, proves : its place in the ladder, such as "2.1", and what it proves, in words
+    experiments : the experiments on whose products it measures, by name
+    sections : those of the experiments that the measurement itself reads, not those that only affect products
+    parameters, small_parameters : values of the fields, and others of these at small scale
+    limits : the conditions on its numbers, by name
     """
 
     registry: ClassVar = STEPS

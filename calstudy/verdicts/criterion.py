@@ -73,19 +73,25 @@ class AtMost(Threshold):
     low: float = field(default=-math.inf, init=False)
 
 
+@dataclass(frozen=True)
 class Equal(Threshold):
     """Equal to `target` within `sigmas` times the uncertainty."""
 
-    def __init__(self, target: float, sigmas: float = 2.0) -> None:
-        self.low = self.high = target
-        self.sigmas = sigmas
+    target: float
+    sigmas: float = 2.0
+    low: float = field(init=False)
+    high: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        for end in ("low", "high"):
+            object.__setattr__(self, end, self.target)
 
     def holds(self, finding: Finding) -> bool:
         """Return true if the value is that close to the target."""
-        return abs(finding.value - self.low) <= self.sigmas * finding.uncertainty
+        return abs(finding.value - self.target) <= self.sigmas * finding.uncertainty
 
     def __str__(self) -> str:
-        return f"{self.low:.3g} within {self.sigmas:g} sigma"
+        return f"{self.target:.3g} within {self.sigmas:g} sigma"
 
 
 @dataclass(frozen=True)

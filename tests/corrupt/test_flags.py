@@ -49,6 +49,13 @@ def test_a_dead_antenna_takes_all_of_its_baselines_and_no_other(observed):
     assert all(len(set(pair)) == 2 for pair in drawn)
 
 
+def test_dead_antennas_that_cannot_be_are_refused(observed):
+    with pytest.raises(InputError, match="dead-antennas: antennas: names antenna 7, but there are 7 antennas, counted"):
+        draw_truth(DeadAntennas(antennas=(7,)), observed)
+    with pytest.raises(InputError, match="count: 5 of 7 antennas would be dead; at most 4 can be, for 3 must be left"):
+        draw_truth(DeadAntennas(count=5), observed)
+
+
 @pytest.mark.parametrize(
     ("effect", "told"),
     [

@@ -187,6 +187,14 @@ def test_a_beam_file_that_takes_data_from_other_files_is_refused(tmp_path):
         mwa_frequencies(path)
 
 
+def test_a_damaged_name_in_an_hdf5_file_is_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "beam.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group(b"\xe9")
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
+        mwa_frequencies(path)
+
+
 def test_x_is_the_east_west_dipole(embedded):
     """A dipole is blind along its axis: far from zenith, feed x sees less to the east than to the north."""
     angle = np.deg2rad(np.arange(70.0, 86.0))

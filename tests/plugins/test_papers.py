@@ -20,6 +20,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.user_code import load_file
 from calstudy.claims.evaluation import evaluate_folder
 from calstudy.experiment.files import override, validate
+from calstudy.papers.barry2016 import Barry2016
 from calstudy.regression import accept, read_reference
 from calstudy.report.page import read_contents
 from calstudy.results.reader import RunFolder
@@ -70,6 +71,16 @@ def test_its_statements_are_judged_as_they_come_out(folder):
     assert "claims: 2 sentences: 1 supported, 1 contradicted; 2 statements: 1 supported, 1 contradicted" in shown
     (table,) = [table for table in read_contents(RunFolder(run.folder)).tables if table.title == "Claims of the paper"]
     assert [row[-1] for row in table.rows] == ["supported", "contradicted"]
+
+
+def test_one_that_derives_from_a_built_in_paper_has_its_statements(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from calstudy.papers.barry2016 import Barry2016\n\n\n"
+        "class Mine(Barry2016):\n    usual_members = {'incomplete': 'another'}\n"
+    )
+    (mine,) = validate({"name": "mine", "papers": [str(path)]}, tmp_path).papers
+    assert mine.statements() == Barry2016(kind="barry2016").statements() != []
 
 
 def test_it_leaves_out_bins_without_modes(tmp_path):

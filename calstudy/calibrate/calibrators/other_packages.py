@@ -94,7 +94,8 @@ class OtherPackage(WeightedFit):
         """Solve every polarization, and flag the gains of antennas and channels without data."""
         from calstudy.calibrate.weights import make_weights, require_finite
 
-        assert assumed.sky_model is not None, "refused before"
+        if assumed.sky_model is None:
+            raise InputError(f"{self.label}: {NO_SKY_MODEL}")
         require_parallel_hands(observation.uvd)
         crosses = ~observation.autos
         groups = self.solves(observation.n_times)

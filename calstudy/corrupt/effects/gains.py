@@ -200,7 +200,11 @@ class FileGains(GainEffect):
     path: Path = Field(strict=False, description="File of gains, relative to the experiment file or absolute.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
-        """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols); raise InputError if the file lacks any."""
+        """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols).
+
+        Raise InputError if the file cannot be read, lacks antennas, channels or polarizations of the observation, or
+        has another number of times.
+        """
         del random
         values = gains_for(read_gains(self.path, "corruption.effects: path", observation.uvd), observation.uvd)
         if values.shape[2] not in (1, observation.n_times):

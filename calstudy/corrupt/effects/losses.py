@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from pydantic import Field
 
+from calstudy.base.errors import InputError
 from calstudy.base.units import Fraction, Frequency
 from calstudy.base.visibilities import channels_per_block
 from calstudy.corrupt.drift import refusal_of_antennas
@@ -91,19 +92,25 @@ class DeadAntennas(Effect):
 
     def refusal(self, size: Size) -> str | None:
         """Refuse antennas that do not exist, and to leave fewer than three."""
-        if (reason := refusal_of_antennas(self.antennas, size.antennas)) is not None:
+        return self._refusal(size.antennas)
+
+    def _refusal(self, count: int) -> str | None:
+        """Return why the effect cannot be applied to `count` antennas, or None."""
+        if (reason := refusal_of_antennas(self.antennas, count)) is not None:
             return f"antennas: {reason}"
         field, dead = ("antennas", len(set(self.antennas))) if self.antennas else ("count", self.count)
-        if size.antennas - dead >= LEAST:
-            return None
-        return (
-            f"{field}: {dead} of {size.antennas} antennas would be dead; at most {max(size.antennas - LEAST, 0)} can "
-            f"be, for {LEAST} must be left"
-        )
+        if count - dead < LEAST:
+            return (
+                f"{field}: {dead} of {count} antennas would be dead; at most {max(count - LEAST, 0)} can be, for "
+                f"{LEAST} must be left"
+            )
+        return None
 
     def draw(self, observation: Observation, random: np.random.Generator) -> Truth:
-        """Return the antenna numbers, ascending."""
+        """Return the antenna numbers, ascending; raise InputError with the sentence of `refusal`."""
         numbers = np.asarray(observation.uvd.telescope.antenna_numbers)
+        if (reason := self._refusal(len(numbers))) is not None:
+            raise InputError(f"corruption.effects: dead-antennas: {reason}")
         dead = list(self.antennas) or random.choice(len(numbers), self.count, replace=False)
         return {"numbers": np.unique(numbers[dead])}
 

@@ -79,7 +79,11 @@ class Calamity2022(Paper):
         return [item for module in modules for item in vars(module).values() if isinstance(item, Statement)]
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
-        """Return in words a setting that is not the paper's, which is the default of all but the weights, or None."""
+        """Return in words an unsuitable setting of an experiment for a role, or None.
+
+        Defaults of experiments are the paper's values, except for the weights. Antennas, channels, integrations and
+        sources may be fewer, and substitutions for the sky and the beam are written with the results.
+        """
         if role == "run_time":
             return "an experiment measures no run times"
         checks = (

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -33,21 +33,24 @@ BLOCK_MEMORY = 500_000_000
 
 
 class _FeedMatrices(Engine):
+    package: ClassVar[str]
+
     def refusal(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> str | None:
         """Return the reason why this engine does not support a simulation, or None if it does."""
         from calstudy.instrument.antenna_beams import split_beams
 
-        if (reason := missing_package(self.kind) or refusal_of_polarization(sky, template)) is not None:
+        if (reason := missing_package(self.package) or refusal_of_polarization(sky, template)) is not None:
             return reason
         beams, _ = split_beams(beam, template)
         if any(list(item.at(template.freq_array[:1]).feed_array) != ["x", "y"] for item in beams):
-            return f"{self.kind} needs beams with feeds x and y"
+            return f"{self.package} needs beams with feeds x and y"
         return None
 
 
 class MatvisEngine(_FeedMatrices):
     """matvis on the CPU, both feeds, with beams interpolated in the same way as in pyuvsim."""
 
+    package: ClassVar[str] = "matvis"
     kind: str = "matvis"
     precision: Literal["single", "double"] = Field(
         "double",
@@ -163,6 +166,7 @@ FLATNESS = 1e-12
 class FftvisEngine(_FeedMatrices):
     """fftvis with both feeds, and beams interpolated in the same way as in pyuvsim."""
 
+    package: ClassVar[str] = "fftvis"
     kind: str = "fftvis"
     precision: Literal["single", "double"] = Field(
         "double",

@@ -124,7 +124,7 @@ class ExperimentStudy(Study):
 
     @property
     def texts(self) -> dict[str, str]:
-        """The resolved experiment, false assumptions of the calibrator below its sky model, deviations of antennas."""
+        """The resolved experiment, the assumptions of the calibrator, and deviations of antennas."""
         found = dict(super().texts)
         if self.experiment.calibrates:
             table = Table(("field", "true", "assumed"), sky_model.differences(self.graph))
