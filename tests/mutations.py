@@ -321,8 +321,8 @@ MUTATIONS = (
     Mutation("a lock that is not taken", "with store.lock(order.task.stage.name, order.key, warn):", "if True:", STORE),
     Mutation(
         "store deletes what a run needs",
-        "            if key not in needed:\n",
-        "            if True:\n",
+        "            if key not in needed:\n                with",
+        "            if True:\n                with",
         ("tests/test_start_commands.py",),
     ),
     Mutation("verify reads no file", 'sha256(self.folder(stage, key) / name) == entry["sha256"]', "True", STORE),
