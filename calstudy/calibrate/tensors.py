@@ -51,7 +51,7 @@ class Ends(NamedTuple):
         return tf.stack([a_real + b_real, a_imaginary - b_imaginary])
 
     def sum_over_antenna(self, values: tf.Tensor, n_antennas: int) -> tf.Tensor:
-        """Add each baseline to a, its conjugate to b, (2, Nbls, Nfreqs) to (2, Nants, Nfreqs): `relative_change`^T."""
+        """Add baselines to a, their conjugates to b: the transpose of `relative_change`, of (2, Nbls, Nfreqs)."""
         (a_real, b_real), (a_imaginary, b_imaginary) = (
             [tf.math.unsorted_segment_sum(part, index, n_antennas) for index in self] for part in tf.unstack(values)
         )
