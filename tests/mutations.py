@@ -325,7 +325,7 @@ MUTATIONS = (
         "            if True:\n                with",
         ("tests/test_start_commands.py",),
     ),
-    Mutation("verify reads no file", 'sha256(self.folder(stage, key) / name) == entry["sha256"]', "True", STORE),
+    Mutation("verify reads no file", 'sha256(product.path / name) == entry["sha256"]', "True", STORE),
     Mutation("a kept product is dropped", ' and product.record.get("temporary")', "", STORE),
     Mutation(
         "what other runs need is dropped",

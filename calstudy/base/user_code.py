@@ -257,8 +257,9 @@ def user_code(name: str) -> Iterator[None]:
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
         if not frames and not isinstance(error, TypeError | SystemExit | ImportError):
             raise
-        for frame in frames[-1:]:
-            name = f"{Path(frame.filename).name} line {frame.lineno}, in {frame.name}"
+        if frames:
+            last = frames[-1]
+            name = f"{Path(last.filename).name} line {last.lineno}, in {last.name}"
         if isinstance(error, SystemExit | KeyboardInterrupt):
             how = f"sys.exit, status {error.code}" if isinstance(error, SystemExit) else "KeyboardInterrupt"
             text = f"it ended the process ({how}); raise an error instead"

@@ -207,16 +207,12 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class CylindricalSpectrum(Cylinder):
-    """A power spectrum in Nb bins of baseline length and Nd delays.
+    """A power spectrum in bins of baseline length and delay.
 
     Attributes
     ----------
-    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges : lower and upper edge of each bin, (Nb, 2), m
-    delay, k_parallel : (Nd,) ascending, s and h/Mpc; from zero up if folded
     power : mean over the pairs of baselines in each bin, (Nb, Nd) complex; the real part estimates P(k)
     n_pairs : pairs of baselines averaged, (Nb,) int
-    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
     """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})

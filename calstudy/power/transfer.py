@@ -164,16 +164,9 @@ RATIOS = ("transfer", "cross_transfer", "scale_free_transfer", "squared_coherenc
 
 @dataclass(frozen=True)
 class TransferMap(Cylinder):
-    """T and C in Nb bins of baseline length and Nd delays from zero up, both signs of the delay together.
+    """T and C in bins of baseline length and delay, as in `TransferFunction`, (Nb, Nd) each.
 
-    Attributes
-    ----------
-    baseline_length, k_perp : mean of each bin, (Nb,) ascending, m and h/Mpc. Bins without baselines do not appear.
-    bin_edges : lower and upper edge of each bin, (Nb, 2), m
-    delay, k_parallel : (Nd,) ascending, s and h/Mpc
-    transfer, transfer_error, cross_transfer, cross_transfer_error
-        As in `TransferFunction`, (Nb, Nd). The two signs of the delay of a baseline are two samples.
-    horizon_delay : |b|/c, the edge of the wedge, (Nb,), s
+    The two signs of the delay of a baseline are two samples.
     """
 
     transfer: np.ndarray = field(metadata={"unit": ""})

@@ -229,16 +229,23 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
         return []
     example = unconverged[0]
     lost = sum(record["status"] not in USABLE for record in records) / len(records)
-    sentences = {
-        "where solves stall, results depend on where they start: T is not determined better than by the spread of two "
-        "starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not depend on "
-        "them": "stalled" in by_status,
-        f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost; in a simulation, errors of "
-        "spectra by noise count them, and are too small by as much": 0 < lost < 1,
+    sentences = []
+    if "stalled" in by_status:
+        sentences.append(
+            "where solves stall, results depend on where they start: T is not determined better than by the spread of "
+            "two starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not "
+            "depend on them"
+        )
+    if 0 < lost < 1:
+        sentences.append(
+            f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost; in a simulation, errors of "
+            "spectra by noise count them, and are too small by as much"
+        )
+    sentences.append(
         f"{len(unconverged)} of {len(records)} solves did not converge ({in_words(by_status)}); integration "
-        f"{example['integration']}: {example['message']}": True,
-    }
-    return [sentence for sentence, is_so in sentences.items() if is_so]
+        f"{example['integration']}: {example['message']}"
+    )
+    return sentences
 
 
 def in_words(by_status: Mapping[str, int]) -> str:

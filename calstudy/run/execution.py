@@ -448,16 +448,18 @@ def execute(
 
     def ready(client: Client) -> dict[Future, Task]:
         """Submit the tasks whose inputs are all made, each once."""
-        return {
-            client.submit(
+        futures = {}
+        for key in order.get_ready():
+            task = by_key[key]
+            future = client.submit(
                 _announce_and_perform,
-                WorkOrder.of(by_key[key], store, key in again),
-                key=f"{by_key[key].stage.name}-{key}-{digest_json(str(store.root))[:8]}",
+                WorkOrder.of(task, store, key in again),
+                key=f"{task.stage.name}-{key}-{digest_json(str(store.root))[:8]}",
                 priority=-places[key],
                 pure=False,
-            ): by_key[key]
-            for key in order.get_ready()
-        }
+            )
+            futures[future] = task
+        return futures
 
     with _client(workers) as client:
         client.subscribe_topic(WAITS, lambda event: warn(event[1]))

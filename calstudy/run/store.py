@@ -123,10 +123,11 @@ class Store:
 
     def verify(self, stage: str, key: str) -> Product | None:
         """Return the product if every file still has its recorded SHA-256, else None."""
-        product = self.find(stage, key)
-        files = {} if product is None else product.record["files"]
+        if (product := self.find(stage, key)) is None:
+            return None
+        files = product.record["files"]
         with suppress(OSError):
-            if all(sha256(self.folder(stage, key) / name) == entry["sha256"] for name, entry in files.items()):
+            if all(sha256(product.path / name) == entry["sha256"] for name, entry in files.items()):
                 return product
         return None
 
