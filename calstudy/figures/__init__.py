@@ -249,7 +249,7 @@ def _listed(kinds: Sequence[str]) -> str:
     return f"for {' or '.join(kinds)} files"
 
 
-class Draw(Task, stage="figure", version=5):
+class Draw(Task, stage="figure", version=6):
     """One figure; `own` are the settings of its own, which are keyed beside the others."""
 
     figure: StudyFigure
@@ -266,7 +266,7 @@ class Draw(Task, stage="figure", version=5):
         """Draw the figure, with the stand-ins below it; raises InputError if it fails or returns no drawing."""
         from matplotlib.figure import Figure
 
-        with guarded(self.figure):
+        with journal_style(), guarded(self.figure):
             found = self.figure.draw(Job(settings=self.settings, inputs=self.products, output=output))
         if not isinstance(found, Drawing) or not isinstance(found.figure, Figure):
             name = type(found).__name__

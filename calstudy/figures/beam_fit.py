@@ -91,7 +91,6 @@ def _rms(difference: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(np.abs(difference) ** 2, axis=(0, 1, 3, 4)))
 
 
-@style.journal_style()
 def draw_interpolations(found: BeamInterpolation) -> style.Figure:
     """Draw differences of Jones components, relative to the zenith, against frequency."""
     figure = style.new_figure(style.ONE_COLUMN, 2.9)
@@ -188,7 +187,6 @@ def _measure(foregrounds: UVData) -> InterpolationFloor:
     )
 
 
-@style.journal_style()
 def draw_delay_floors(floors: Mapping[str, InterpolationFloor], eor_level: float | None) -> style.Figure:
     """Draw delay spectra of short baselines, and the floor against baseline length; `eor_level` in dB or None."""
     figure = style.new_figure(style.TWO_COLUMNS, 3.0)

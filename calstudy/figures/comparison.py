@@ -51,7 +51,6 @@ def cross_entries(cases: Mapping[str, Mapping[str, Case]]) -> list[Line2D]:
     return [style.entry(label="most solves did not converge", **CROSS)] if crossed else []
 
 
-@style.journal_style()
 def draw_spectra(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
     """Draw P^R / P^S on the left and s^2 P^R0 / P^S on the right against k, with 95 % bars, a row for each world."""
     figure = style.new_figure(style.TWO_COLUMNS, 0.6 + ROW_HEIGHT * len(cases))
@@ -121,7 +120,6 @@ LINEAR_BIAS = 0.01
 LABEL_WIDTH = 10
 
 
-@style.journal_style()
 def draw_curves(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
     """Draw T above and the bias below for each band of k, calibrators from left to right, with 95 % bars."""
     worlds = list(cases)
@@ -194,7 +192,6 @@ def _names(groups: Mapping[str, Mapping[str, str]]) -> list[str]:
     return list(dict.fromkeys(variant for group in groups.values() for variant in group))
 
 
-@style.journal_style()
 def draw_variants(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
     """Draw a panel for each kind of world and band of k: calibrators from top to bottom, the bias from left to right.
 

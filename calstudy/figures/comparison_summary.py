@@ -40,7 +40,6 @@ MAX_COLUMNS = 11
 """Largest number of worlds side by side; more are one below the other, and calibrators are the columns."""
 
 
-@style.journal_style()
 def draw_matrix(cases: Mapping[str, Mapping[str, Case]], calibrators: Sequence[str]) -> style.Figure:
     """Draw a matrix for each band of k: worlds from left to right, or from top to bottom where they are many.
 
@@ -151,7 +150,6 @@ ZERO = 0.3
 """Where severity zero is drawn, relative to the lowest other one."""
 
 
-@style.journal_style()
 def draw_tolerances(
     found: Sequence[Fault],
     cases: Mapping[str, Mapping[str, Case]],

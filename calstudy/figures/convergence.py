@@ -45,7 +45,6 @@ class ConvergencePath:
     predicted: np.ndarray
 
 
-@style.journal_style()
 def draw_convergence(paths: Sequence[ConvergencePath], integrations: Sequence[int]) -> style.Figure:
     """Draw the bias without EoR on the left, and with EoR on the right, against the steps of solvers.
 

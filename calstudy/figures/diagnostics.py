@@ -88,7 +88,6 @@ def _delay_rms(cube: np.ndarray, grid: ChannelGrid) -> np.ndarray:
     return np.fft.fftshift(np.sqrt(power / len(cube)), axes=-1) * grid.n_channels / taper.sum()
 
 
-@style.journal_style()
 def draw_diagnostics(found: Diagnostics) -> style.Figure:
     """Draw four rows: delay spectra by baseline length, their mean and convergence, the gains, and chi^2.
 

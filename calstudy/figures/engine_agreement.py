@@ -126,7 +126,6 @@ def _groups(reference: UVData, difference: UVData, taper: Taper) -> tuple[GroupA
     return tuple(groups)
 
 
-@style.journal_style()
 def draw_engine_agreement(
     agreement: EngineAgreement, names: Sequence[str], allowed: float, eor_level: float | None
 ) -> style.Figure:

@@ -28,7 +28,6 @@ ACROSS = 3
 """Number of panels in a row."""
 
 
-@style.journal_style()
 def draw_gain_coverage(members: Mapping[str, Covered]) -> style.Figure:
     """Draw observed against expected fractions, and below it their difference with 1.96 standard errors.
 

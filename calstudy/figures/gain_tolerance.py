@@ -78,7 +78,6 @@ def tolerated(law: GainBias, bias: np.ndarray, error: np.ndarray) -> Tolerated:
     return Tolerated(law, bias, error, sigma, spread)
 
 
-@style.journal_style()
 def draw_gain_tolerance(
     worlds: Mapping[str, Tolerated],
     eor_level: float | None = None,

@@ -51,7 +51,6 @@ def compare_gains(
     return GainComparison(antennas, *(in_two_domains(frequency, values) for values in spectra))
 
 
-@style.journal_style()
 def draw_gains(comparison: GainComparison) -> style.Figure:
     """Draw real parts against frequency (left) and transforms' amplitudes against delay (right)."""
     figure, (*gains, as_fitted, aligned), delays = frequency_and_delay(rows=4)
@@ -131,7 +130,6 @@ class Gains(InspectedFigure):
         return Drawing(draw_gains(comparison), comparison)
 
 
-@style.journal_style()
 def draw_reflections(gains: TwoDomains) -> style.Figure:
     """Draw the amplitude of the transform of every antenna's gain, (Nants, Nfreqs), and their median, in one column.
 

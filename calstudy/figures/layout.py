@@ -31,7 +31,6 @@ class LayoutPanel:
     highlight: tuple[int, ...] = ()
 
 
-@style.journal_style()
 def draw_layouts(panels: Sequence[LayoutPanel]) -> style.Figure:
     """Draw one or two arrays, east to the right and north up, in equal scales."""
     width, height = (style.ONE_COLUMN, 3.4) if len(panels) == 1 else (style.TWO_COLUMNS, 3.8)

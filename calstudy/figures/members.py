@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from calstudy.power.spectra import SphericalSpectrum
 
 
-@style.journal_style()
 def draw_member_bias(members: Mapping[str, Score]) -> style.Figure:
     """Draw |bias| against k, or, where it is within its 95 % error, the 95 % upper limit as an open symbol."""
     figure = style.new_figure(style.TWO_COLUMNS, 3.4)
@@ -95,7 +94,6 @@ ARRAYS = {
 """The roles of the members with either solver, in the order of `SOLVERS`."""
 
 
-@style.journal_style()
 def draw_solver_comparison(arrays: Mapping[str, tuple[SphericalColumn, SphericalColumn]]) -> style.Figure:
     """Draw P^R, and below it P^R without EoR, of two solvers: a column for each array.
 

@@ -34,7 +34,6 @@ MARKINGS = {
 COLUMNS = {"all-modes": "all modes", "outside-wedge": "outside wedge + {:.0f} ns"}
 
 
-@style.journal_style()
 def draw_observed(columns: Mapping[str, Mapping[str, SphericalSpectrum]], buffer: float) -> style.Figure:
     """Draw |P| of measured data, mK² h⁻³ Mpc³, with 95 % bars of the noise, open where negative; see `COLUMNS`.
 
@@ -118,7 +117,6 @@ class ObservedWedge(StudyFigure):
         return Drawing(figure, found)
 
 
-@style.journal_style()
 def draw_observed_loss(loss: SignalLoss, buffer: float) -> style.Figure:
     """Draw T as in `calstudy.figures.signal_loss`, with the expectation outside the wedge as a line."""
     where = f"wedge + {1e9 * buffer:.0f} ns"

@@ -33,7 +33,6 @@ KINDS = {"eor": ("o", style.BLUE, r"P^S", -0.15), "input": ("s", style.ORANGE, r
 BLOCKS = (style.ORANGE, style.GREEN, style.MAGENTA)
 
 
-@style.journal_style()
 def draw_realizations(
     results: Mapping[str, RegionResults],
     names: Sequence[str],
@@ -226,7 +225,6 @@ def _arrays(results: Mapping[str, RegionResults]) -> dict[str, Any]:
 CSV = "realizations-comparison.csv"
 
 
-@style.journal_style()
 def draw_comparison(arrays: Mapping[str, PooledRegion], difference: Pooled, max_k: float = 1.0) -> style.Figure:
     """Draw T of two arrays, by title, with the scatter of one realization, and their difference with 95 % bars.
 

@@ -51,7 +51,6 @@ def summarize_runtime(label: str, size: ArrayLike, seconds: Sequence[Sequence[fl
     return RuntimeSeries(label, sizes, median, low, high, fit_power_law(sizes, median))
 
 
-@style.journal_style()
 def draw_runtime(
     series: Sequence[RuntimeSeries],
     size_label: str,

@@ -47,7 +47,6 @@ def _last_k(*parts: TransferFunction) -> float:
     return float(np.clip(parts[0].bin_edges[1:][filled].max(initial=0), 0.1, 1.5))
 
 
-@style.journal_style()
 def draw_signal_loss(loss: SignalLoss, buffer: float = 100e-9) -> style.Figure:
     """Draw T per |k| outside and inside the wedge with 95 % bars on the left, per (|b|, tau) on the right.
 
@@ -133,7 +132,6 @@ class SignalLossFigure(StudyFigure):
 MAX_DELAY = 1.5e-6
 
 
-@style.journal_style()
 def draw_expected_loss(
     expected: ExpectedBins, measured: TransferFunction, by_length: TransferMap, buffer: float = 100e-9
 ) -> style.Figure:

@@ -93,7 +93,6 @@ def count_sources(sky: SkyModel) -> SourceCounts:
     return SourceCounts(edges, number, expected=area * steps.reshape(BINS, -1).sum(axis=1), area=area)
 
 
-@style.journal_style()
 def draw_counts(counts: SourceCounts) -> style.Figure:
     """Draw Euclidean-normalized counts above, and their ratio to Franzen et al. (2019) with a band of 5 % below."""
     figure = style.new_figure(style.ONE_COLUMN, 3.6)
@@ -218,7 +217,6 @@ def _baselines(foregrounds: UVData, eor: UVData, factor: float, taper: str) -> t
     )
 
 
-@style.journal_style()
 def draw_components(components: SimulatedComponents) -> style.Figure:
     """Draw the wedge of F and P(k) of S above, and delay spectra of a short, a median and a long baseline below."""
     figure = style.new_figure(style.TWO_COLUMNS, 5.2)

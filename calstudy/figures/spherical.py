@@ -83,7 +83,6 @@ PUBLISHED = "published"
 LIMIT_MARKERS = ("v", "1", "$\\downarrow$", "P", "X", "*")
 
 
-@style.journal_style()
 def draw_spherical(
     columns: Sequence[SphericalColumn], limits: Sequence[Limits] = (), z: float = math.nan
 ) -> style.Figure:

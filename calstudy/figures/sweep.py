@@ -38,7 +38,6 @@ class SweepPanel:
     transfers: list[TransferFunction]
 
 
-@style.journal_style()
 def draw_sweep(panels: Sequence[SweepPanel]) -> style.Figure:
     """Draw T outside the wedge in bands of k, with 95 % bars, against the values of every varied field.
 

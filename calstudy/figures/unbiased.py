@@ -69,7 +69,6 @@ def recovered(found: Sequence[UnbiasedSpectrum]) -> Recovered:
     return Recovered(found[0].k, **by_name, within=within, realizations=len(found))
 
 
-@style.journal_style()
 def draw_unbiased(found: UnbiasedSpectrum) -> style.Figure:
     """Draw P^S, P^R and W^-1 P^R with 95 % bars, and beside them the window functions, each over its sum.
 
@@ -97,7 +96,6 @@ def draw_unbiased(found: UnbiasedSpectrum) -> style.Figure:
     return figure
 
 
-@style.journal_style()
 def draw_recovered(groups: Mapping[str, Mapping[str, Recovered]]) -> style.Figure:
     """Draw the means over realizations, over the power of the signals, with bars of 1.96 standard errors.
 

@@ -53,7 +53,6 @@ def compare_visibilities(
     return VisibilityComparison(*baseline, *spectra)
 
 
-@style.journal_style()
 def draw_comparison(comparison: VisibilityComparison, labels: tuple[str, str]) -> style.Figure:
     """Draw real parts against frequency (left), and amplitudes of transforms and the wedge against delay (right).
 
@@ -170,7 +169,6 @@ LINES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-@style.journal_style()
 def draw_baselines(baselines: Sequence[BaselineSpectra]) -> style.Figure:
     """Draw one panel per baseline on common axes, with the edges of the wedge; a single one fills one column."""
     n_columns = min(2, len(baselines))

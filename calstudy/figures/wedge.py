@@ -33,7 +33,6 @@ TITLES = {
 """Perfect gains, gain errors, the calibrated residual, the EoR alone, and noise alone."""
 
 
-@style.journal_style()
 def draw_wedge(
     spectra: Mapping[str, CylindricalSpectrum], titles: Mapping[str, str] = TITLES, buffer: float = 100e-9
 ) -> style.Figure:

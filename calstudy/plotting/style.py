@@ -96,6 +96,8 @@ _LOCK = RLock()
 def journal_style() -> Iterator[None]:
     """Draw or save with the settings of this module, regardless of the user's; also a decorator.
 
+    All figures of a study, also those of plug-ins, are drawn in it.
+
     Matplotlib's settings are global to the process: they are restored on exit, and a lock keeps two threads of a study
     from drawing at once.
     """

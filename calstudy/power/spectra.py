@@ -102,27 +102,51 @@ class DelaySpectra:
         return members
 
     def of_units(self, units: np.ndarray) -> DelaySpectra:
-        """Return the spectra of some units, by their numbers, ascending."""
-        shares = np.isin(self.share_unit, units)
+        """Return the spectra of some units, by their numbers, in this order."""
+        place = np.full(self.n_pairs.size, -1)
+        place[units] = np.arange(units.size)
+        shares = place[self.share_unit] >= 0
         return replace(
             self,
             power=self.power[units],
             vectors=self.vectors[units],
             n_pairs=self.n_pairs[units],
             k_perp=self.k_perp[units],
-            share_unit=np.searchsorted(units, self.share_unit[shares]),
+            share_unit=place[self.share_unit[shares]],
             share_antenna=self.share_antenna[shares],
             share_pairs=self.share_pairs[shares],
             share_power=self.share_power[shares],
         )
+
+    def with_pairs_of(self, other: DelaySpectra) -> DelaySpectra:
+        """Return these spectra with the numbers of pairs of `other`, whose units have the same antennas or fewer.
+
+        Powers of units, and mean powers of the pairs of an antenna, stay: the pairs of a unit see the same sky.
+        """
+        place = {pair: share for share, pair in enumerate(zip(self.share_unit, self.share_antenna, strict=True))}
+        shares = np.array([place[pair] for pair in zip(other.share_unit, other.share_antenna, strict=True)], dtype=int)
+        part = other.share_pairs / self.share_pairs[shares]
+        return replace(
+            self,
+            n_pairs=other.n_pairs,
+            share_unit=other.share_unit,
+            share_antenna=other.share_antenna,
+            share_pairs=other.share_pairs,
+            share_power=part[:, None] * self.share_power[shares],
+        )
+
+
+def _reach(spectra: DelaySpectra, correlation: float) -> float:
+    """Return the difference of two baselines, in m, at which the correlation of their powers falls to this."""
+    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / SPEED_OF_LIGHT) ** 2
+    return float(np.sqrt(-np.log(correlation) / rate))
 
 
 def signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the pairs of units that share signal, in both orders and with themselves, and correlations of powers."""
     from scipy.spatial import cKDTree
 
-    rate = 2 * np.pi * spectra.omega_pp * (spectra.frequency / SPEED_OF_LIGHT) ** 2
-    reach = np.sqrt(-np.log(NEGLIGIBLE) / rate)
+    reach = _reach(spectra, NEGLIGIBLE)
     tree = cKDTree(spectra.vectors)
     units = np.arange(len(spectra.vectors))
     # V(-b) is the conjugate of V(b), its powers those at -tau: the same |k|.
@@ -135,7 +159,7 @@ def signal_correlation(spectra: DelaySpectra) -> tuple[np.ndarray, np.ndarray, n
         np.linalg.norm(spectra.vectors[first] - spectra.vectors[second], axis=1),
         np.linalg.norm(spectra.vectors[first] + spectra.vectors[second], axis=1),
     )
-    correlation = np.exp(-rate * distance**2)
+    correlation = NEGLIGIBLE ** ((distance / reach) ** 2)
     return (
         np.concatenate([units, first, second]),
         np.concatenate([units, second, first]),
@@ -302,12 +326,13 @@ def length_bins(lengths: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarr
 
 
 def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpectra]:
-    """Return the spectra of the units that all have in common, each averaged over the same pairs of baselines.
+    """Return the spectra of the units that all have in common, with the same numbers of pairs of baselines.
 
     Baselines that are completely flagged have no spectra. Those of an antenna without gains are missing in the spectra
-    of the residual, but not in those of the EoR. The spectra, by name, have the same delays and their units in the same
-    order. A warning says if they are averages of different times or polarizations. Raise InputError if they have no
-    unit in common or units that cannot be told apart, and ValueError if the order differs.
+    of the residual, but not in those of the EoR. A redundant group that lacks some of its baselines in one of the
+    spectra is the same sample of the sky, and counts as many pairs in all. The spectra, by name, have the same delays
+    and their units in the same order. A warning says if they are averages of different times or polarizations. Raise
+    InputError if they have no unit in common or units that cannot be told apart.
     """
     averaged = {name: (one.n_times, one.n_polarizations) for name, one in spectra.items()}
     if len(set(averaged.values())) > 1:
@@ -326,19 +351,36 @@ def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpect
             "be told: baselines of the same vector need the shares of their antennas (share_unit, share_antenna, "
             "share_pairs and share_power), which the estimator does not give"
         )
-    places = {name: {key: unit for unit, key in enumerate(found)} for name, found in zip(spectra, keys, strict=True)}
-    common = set.intersection(*(set(found) for found in places.values()))
-    if not common:
+    fewest = min(spectra.values(), key=lambda one: one.n_pairs.sum())
+    matches = {name: _counterparts(fewest, one) for name, one in spectra.items()}
+    common = np.logical_and.reduce([found >= 0 for found in matches.values()])
+    if not common.any():
         raise InputError("no baseline has data in all of " + ", ".join(spectra))
-    most = max(map(len, keys))
-    logger.warning("%d of %d baselines or redundant groups are left out: flagged", most - len(common), most)
-    order = [key for key in first if key in common]
-    found = {}
-    for name, one in spectra.items():
-        units = np.array([places[name][key] for key in order])
-        if (np.diff(units) <= 0).any():
-            raise ValueError(f"the units of {name} are in another order, expected the same")
-        found[name] = one.of_units(units)
+    left_out = max(map(len, keys)) - int(common.sum())
+    if left_out:
+        logger.warning("%d of %d baselines or redundant groups are left out: flagged", left_out, max(map(len, keys)))
+    kept = fewest.of_units(np.flatnonzero(common))
+    return {name: one.of_units(matches[name][common]).with_pairs_of(kept) for name, one in spectra.items()}
+
+
+def _counterparts(spectra: DelaySpectra, other: DelaySpectra) -> np.ndarray:
+    """Return the unit of `other` with the pairs of each unit, (Nu,): a baseline, or a group with at least its pairs.
+
+    Groups that lack baselines have other mean vectors, whose powers must correlate by `SAME_SKY`. -1 if there is none.
+    """
+    from scipy.spatial import cKDTree
+
+    place = {key: unit for unit, key in enumerate(other.pairs_of_units())}
+    found = np.array([place.get(key, -1) for key in spectra.pairs_of_units()])
+    shares, of_other = spectra._shares_of_units(), other._shares_of_units()
+    tree = cKDTree(other.vectors)
+    for unit in np.flatnonzero((found < 0) & (spectra.n_pairs > 1)):
+        near = np.array(tree.query_ball_point(spectra.vectors[unit], _reach(spectra, SAME_SKY)), dtype=int)
+        distance = np.linalg.norm(other.vectors[near] - spectra.vectors[unit], axis=1)
+        for candidate in near[np.argsort(distance)].tolist():
+            if all(of_other[candidate].get(antenna, 0) >= count for antenna, count in shares[unit].items()):
+                found[unit] = candidate
+                break
     return found
 
 

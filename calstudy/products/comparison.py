@@ -113,7 +113,7 @@ def best(found: Mapping[str, Case], band: int) -> str | None:
     return min(known, key=lambda name: known[name], default=None)
 
 
-class Comparison(Task, stage="comparison", version=11):
+class Comparison(Task, stage="comparison", version=12):
     """The scores of all cases, of which some are refused: world, calibrator and why it cannot work there."""
 
     title: str

@@ -274,7 +274,7 @@ class AverageEor(Added, InBlocks, stage="observed-eor-average", version=1):
         return _cost_of_average(self)
 
 
-class ObservedTransfer(Injected, stage="observed-transfer", version=6, cost=Cost(4, disk=1e6)):
+class ObservedTransfer(Injected, stage="observed-transfer", version=7, cost=Cost(4, disk=1e6)):
     """T of measured data."""
 
     def make(self, output: Path) -> Mapping[str, Any]:

@@ -85,7 +85,7 @@ class ScoreTable(StudyTable):
         return [score(graph)]
 
 
-class MeasureScore(Task, stage="score", version=6):
+class MeasureScore(Task, stage="score", version=7):
     """The scores in bins and in bands of k, and other numbers by which calibrators are compared."""
 
     power: PowerSettings

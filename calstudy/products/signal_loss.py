@@ -174,7 +174,7 @@ class Injected(Task):
         return [Table(columns, rows, "Signal loss", NOTE)]
 
 
-class Transfer(Injected, stage="transfer", version=7, cost=Cost(1, disk=1e6)):
+class Transfer(Injected, stage="transfer", version=8, cost=Cost(1, disk=1e6)):
     """T per k outside and inside the wedge and per (|b|, tau)."""
 
     scale: Input
@@ -219,7 +219,7 @@ def write_transfer(
     return summary
 
 
-class SweepSummary(Task, stage="sweep-summary", version=2):
+class SweepSummary(Task, stage="sweep-summary", version=3):
     """T, bias and solves of all points of a sweep, which have by label the values of the varied fields.
 
     The wedge buffers are in `points` as well. `measured` has T of each by label, and as ``label:name`` its score, and

@@ -159,8 +159,8 @@ def draw_all(wedge_panels, make_column, visibility_comparison, baseline_spectra)
             "reflections": lambda: draw_reflections(in_two_domains(FREQUENCY, gains[0])),
             "runtime": lambda: draw_runtime(steps, "number of antennas", r"N_\mathrm{ant}"),
         }
-        drawn = {name: drawings[name]() for name in only or drawings}
         with style.journal_style():
+            drawn = {name: drawings[name]() for name in only or drawings}
             for figure in drawn.values():
                 style.note_stand_ins(figure, stand_ins)
         return drawn

@@ -74,8 +74,8 @@ def test_t_has_no_more_decimals_than_its_error_allows(transfer, error, worlds, t
 @pytest.mark.parametrize("worlds", [1, 3, 6, 8, 11, 18])
 def test_texts_stay_in_their_cells(worlds):
     widest = case(bias=0.0984, bias_error=0.0984, transfer=-0.374, transfer_error=0.26, stalled=4)
-    figure = draw({f"w{number}": widest for number in range(worlds)})
     with style.journal_style():
+        figure = draw({f"w{number}": widest for number in range(worlds)})
         figure.draw_without_rendering()
         axes = figure.axes[0]
         width = axes.get_window_extent().width / axes.images[0].get_array().shape[1]

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 import yaml
@@ -17,6 +18,7 @@ from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.experiment.model import FIGURES
+from calstudy.plotting.style import journal_style
 from calstudy.regression import accept, compare_figures, read_reference, read_run, rules_of
 from calstudy.report.page import read_contents
 from calstudy.results.reader import RunFolder
@@ -44,6 +46,8 @@ class Broken(StudyFigure):
         raise KeyError("no such array")
 """
 SIZES = """
+import matplotlib
+
 from calstudy.figures import Drawing, StudyFigure
 from calstudy.plotting import style
 
@@ -57,7 +61,7 @@ class Sizes(StudyFigure):
 
     def draw(self, job):
         sides = [job.settings["layouts"][role].side for role in self.titles]
-        return Drawing(style.new_figure(2.0, 2.0), {"sides": sides})
+        return Drawing(style.new_figure(2.0, 2.0), {"sides": sides, "size": matplotlib.rcParams["font.size"]})
 """
 
 
@@ -224,6 +228,8 @@ def test_one_that_compares_members_of_a_collection_without_papers(folder):
     run = run_study(load_study(path), Budget(workers=1), Console(file=io.StringIO()))
     with np.load(run.folder / "figures" / "sizes.npz") as arrays:
         assert arrays["sides"].tolist() == [2, 2]
+        with journal_style():
+            assert arrays["size"] == mpl.rcParams["font.size"] != mpl.rcParamsDefault["font.size"]
     assert not (run.folder / "claims.json").exists()
     assert json.loads((run.folder / "manifest.json").read_text())["captions"] == {"sizes": "Sizes."}
     accept(run.folder, folder / "reference")

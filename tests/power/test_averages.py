@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import baseline_vectors
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, to_cube
 from calstudy.instrument.array_layouts.geometric import HexLayout
 from calstudy.instrument.array_layouts.observatories import MwaLayout
+from calstudy.instrument.layouts import redundant_groups
 from calstudy.power import binned, delay
 from calstudy.power import cosmology as c
 from calstudy.power.binned import cylindrical_average, make_bin_edges, modes_in_bins, noise_error, spherical_average
+from calstudy.power.clusters import clusters_in_k
 from calstudy.power.estimate import estimate_power
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import (
@@ -523,6 +525,32 @@ def test_redundant_baselines_without_shares_are_not_matched(observe, white, beam
         InputError, match=r"of eor, residual are not of the same baselines.*\(share_unit, share_antenna"
     ):
         of_common_units({"eor": whole, "residual": part})
+
+
+def test_redundant_groups_that_lack_an_antenna_keep_the_signal(observe, white, beam, caplog):
+    """An antenna without gains is missing in most groups. The other baselines of a group see the same sky."""
+    settings = PowerSettings(pairs="redundant-group", wedge_buffer="0 ns")
+    template, rng = observe(HexLayout(kind="hex", side=3), n_channels=64), np.random.default_rng(5)
+    uvd = white(template, rng)
+    groups, cube = redundant_groups(baseline_vectors(uvd), settings.redundancy_tolerance), to_cube(uvd).copy()
+    cube = cube[:, np.unique(groups.index, return_index=True)[1][groups.index]]
+    uvd = from_cube(uvd, np.where(groups.conjugated[:, None, None], cube.conj(), cube))
+    eor = delay_spectra(estimate_power(uvd, uvd, beam, settings), settings)
+    for flagged in (0, 9):
+        part = uvd.copy()
+        part.flag_array |= (antenna_pairs(part) == flagged).any(axis=1)[:, None, None]
+        residual = delay_spectra(estimate_power(part, part, beam, settings), settings)
+        caplog.clear()
+        common = of_common_units({"eor": eor, "residual": residual})
+        assert len(common["eor"].n_pairs) == len(residual.n_pairs) > 0.7 * len(eor.n_pairs)
+        lost = len(eor.n_pairs) - len(residual.n_pairs)
+        assert (f"{lost} of {len(eor.n_pairs)} baselines or redundant groups are left out" in caplog.text) == (lost > 0)
+        for name in ("n_pairs", "share_unit", "share_antenna", "share_pairs"):
+            np.testing.assert_array_equal(getattr(common["eor"], name), getattr(common["residual"], name))
+        clusters = clusters_in_k(common["eor"], np.array([0.0, 1.0, 3.0]), 0.0, inside=False)
+        found, error = clusters.powers(common["residual"]).ratio(clusters.powers(common["eor"]))
+        np.testing.assert_allclose(found, 1)
+        np.testing.assert_allclose(error, 0, atol=1e-7)
 
 
 def test_tables_come_back(tmp_path):
