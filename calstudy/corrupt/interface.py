@@ -81,6 +81,13 @@ class Effect(Plugin, ABC):
         """True if the effect defines flags."""
         return type(self).flags is not Effect.flags
 
+    @property
+    def drawn_seeds(self) -> dict[str, int | tuple[int, int]]:
+        """What seeds the generators that are used, by field; equal ones draw the same numbers."""
+        own, drift = getattr(self, "seed", None), getattr(self, "drift", None)
+        found = {} if own is None else {"seed": own}
+        return found if drift is None else {**found, "drift.seed": drift.stream(own)}
+
     def cost(self, size: Size) -> Cost:
         """Return the cost of `apply` besides a pass over the data; by default nothing."""
         del size

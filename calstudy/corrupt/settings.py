@@ -44,15 +44,12 @@ class CorruptionSettings(Section):
     def _effects_are_independent(self) -> CorruptionSettings:
         seen: dict[Any, int] = {}
         for place, effect in enumerate(self.effects):
-            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
-            seeds = [("seed", own, own)]
-            if drift is not None:
-                seeds.append(("drift.seed", drift.seed, drift.stream(own)))
-            for name, seed, identity in seeds:
-                if identity is not None and identity in seen:
+            for name, seed in effect.drawn_seeds.items():
+                if seed in seen:
+                    first = seed[0] if isinstance(seed, tuple) else seed
                     raise fault(
                         f"effects.{place}.{name}",
-                        f"is {seed}, as that of item {seen[identity]}: what they draw would not be independent",
+                        f"is {first}, as that of item {seen[seed]}: what they draw would not be independent",
                     )
-                seen[identity] = place
+                seen[seed] = place
         return self

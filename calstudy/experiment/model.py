@@ -273,16 +273,13 @@ class Experiment(Section):
         if any(seed in twins and twins.index(seed) != place for place, seed in enumerate(even_and_odd)):
             yield "corruption.noise.seeds_without_eor", "has the seed of even data where seeds has that of odd data"
         built = self.instrument.as_built.drawn_seeds
-        drawn: list[tuple[str, int | None]] = [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
+        drawn: list[tuple[str, Any]] = [(f"instrument.as_built.{name}", seed) for name, seed in built.items()]
         drawn += [("corruption.noise", seed) for seed in {*even_and_odd, *twins}]
         for place, effect in enumerate(self.corruption.effects):
-            own, drift = getattr(effect, "seed", None), getattr(effect, "drift", None)
-            drawn.append((f"corruption.effects.{place}.seed", own))
-            if drift is not None and isinstance(stream := drift.stream(own), int):
-                drawn.append((f"corruption.effects.{place}.drift.seed", stream))
+            drawn += [(f"corruption.effects.{place}.{name}", seed) for name, seed in effect.drawn_seeds.items()]
         for (other, its), (path, seed) in combinations(drawn, 2):
             # Effects are compared with each other, and with their drifts, by `CorruptionSettings`.
-            if seed == its is not None and not (other.startswith("corruption.effects") or other == path):
+            if seed == its and not (other.startswith("corruption.effects") or other == path):
                 yield path, f"is {seed}, as that of {other}: give one of them another"
         if isinstance(diffuse, SyntheticDiffuse) and eor.spectrum != "flat" and diffuse.seed == eor.seed:
             yield "sky.diffuse.seed", f"is {diffuse.seed}, as that of sky.eor: give one of them another"

@@ -276,3 +276,7 @@ def test_two_effects_with_one_seed_are_refused():
     settings = CorruptionSettings.model_validate(both)
     assert settings.gains == PerChannelGains()
     assert CorruptionSettings(effects=()).gains is None
+    dead = [{"kind": "dead-antennas", "antennas": [antenna]} for antenna in (0, 5)]
+    assert len(CorruptionSettings.model_validate({"effects": dead}).effects) == 2
+    with pytest.raises(ValidationError, match="would not be independent"):
+        CorruptionSettings.model_validate({"effects": ["dead-antennas", {"kind": "dead-antennas", "count": 2}]})

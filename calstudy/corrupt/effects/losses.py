@@ -90,6 +90,11 @@ class DeadAntennas(Effect):
     count: int = Field(1, ge=1, description="How many are drawn, where none are named.")
     seed: int = Field(12, ge=0, description="Seed of the choice of `count` antennas.")
 
+    @property
+    def drawn_seeds(self) -> dict[str, int | tuple[int, int]]:
+        """What seeds the choice; nothing where antennas are named."""
+        return {} if self.antennas else super().drawn_seeds
+
     def refusal(self, size: Size) -> str | None:
         """Refuse antennas that do not exist, and to leave fewer than three."""
         return self._refusal(size.antennas)
