@@ -207,3 +207,9 @@ def subset_template(template: UVData, times_jd: np.ndarray, frequencies: np.ndar
 def channels_per_block(frequencies: np.ndarray, width: float) -> int:
     """Return how many channels, at least one, a block has that is `width` Hz wide; frequencies are in Hz."""
     return max(1, round(width / np.abs(np.diff(frequencies)).min(initial=np.inf)))
+
+
+def crosses_of(data: UVData) -> UVData:
+    """Return the cross-correlations of rectangular, time-major data."""
+    crosses = np.flatnonzero(data.ant_1_array != data.ant_2_array)
+    return data.select(blt_inds=crosses, inplace=False, run_check=False)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from calstudy.calibrate.problem import CalibrationProblem, gain_products
 
@@ -90,11 +89,9 @@ class TangentSpace:
         """Return W y of whitened changes y, (1 - P_F) y if foregrounds are free; complex, (Nbls, Nfreqs, ...)."""
         result = values.copy()
         result[self.conjugated] = result[self.conjugated].conj()
-        # Matrices of single models are small: threads that share them mostly wait for each other.
-        with threadpool_limits(limits=1, user_api="blas"):
-            for response in self.responses:
-                rows = result[response.members]
-                result[response.members] = rows - response.absorb(rows)
+        for response in self.responses:
+            rows = result[response.members]
+            result[response.members] = rows - response.absorb(rows)
         result[self.conjugated] = result[self.conjugated].conj()
         return result
 

@@ -23,9 +23,11 @@ from hera_pspec.pspecbeam import PSpecBeamFromArray
 from pyuvdata import UVData, utils
 
 from calstudy.base.constants import BOLTZMANN, SPEED_OF_LIGHT
+from calstudy.base.errors import InputError
 from calstudy.base.visibilities import antenna_pairs, baseline_vectors
 from calstudy.instrument.layouts import redundant_groups
 from calstudy.power.cosmology import hera_conversions, make_cosmology, redshift
+from calstudy.power.delay import make_taper
 
 if TYPE_CHECKING:
     from hera_pspec.conversions import Cosmo_Conversions
@@ -227,6 +229,9 @@ def kelvin_per_jansky(frequencies: np.ndarray, omega_p: np.ndarray, pol_conventi
 
 SAME_CHANNEL = 0.01
 """Part of a channel's width by which the frequencies of two halves may differ."""
+MOST_NOISE = 1.5
+"""Of a pair of baselines, over that of pairs with the same flags. The power is divided by the sum of the squared taper
+over the channels that both have, which increases noise and sidelobes without limit where these are few."""
 
 
 @lru_cache(maxsize=4)
@@ -249,11 +254,12 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     and read back. It has hera_pspec's conventions: conj(even) times odd, with the kernel exp(-2 pi i tau nu), so that
     its delay axis is the paper's, reversed.
 
-    Baselines that are completely flagged are left out. Raise ValueError if the data sets differ in anything but data,
-    have more than one integration, are not in Jy, or leave no unflagged pair.
+    Pairs of baselines that are completely flagged in a polarization, or have few channels in common, are left out.
+    Raise ValueError if the data sets differ in anything but data, have more than one integration or are not in Jy, and
+    InputError if no pair is left.
     """
     _require_match(even, odd)
-    pairs = _unflagged(make_pairs(even, settings), even, odd)
+    pairs = _usable(make_pairs(even, settings), even, odd, settings.taper)
     frequencies = even.freq_array
     angles = {int(pol): beam.solid_angles(frequencies, utils.polnum2str(pol)) for pol in even.polarization_array}
     centre = float(redshift(frequencies.mean()))
@@ -282,18 +288,33 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
     )
 
 
-def _unflagged(pairs: list[Pair], even: UVData, odd: UVData) -> list[Pair]:
-    """Leave out pairs with a baseline that has no data in some polarization."""
-    usable = []
-    for uvd in (even, odd):
-        listed = antenna_pairs(even)[~uvd.flag_array.all(axis=1).any(axis=1)].tolist()
-        usable.append({(a, b) for a, b in listed} | {(b, a) for a, b in listed})
-    kept = [pair for pair in pairs if pair[0] in usable[0] and pair[1] in usable[1]]
-    if not kept:
-        raise ValueError("all pairs of baselines are flagged, expected at least one with data")
-    if len(kept) < len(pairs):
-        logger.warning("left out %d of %d pairs of baselines: flagged", len(pairs) - len(kept), len(pairs))
-    return kept
+def _usable(pairs: list[Pair], even: UVData, odd: UVData, taper: str) -> list[Pair]:
+    """Leave out pairs that have no data in some polarization, or too few channels in common (`MOST_NOISE`)."""
+    numbers = antenna_pairs(even).tolist()
+    rows = {pair: row for row, (a, b) in enumerate(numbers) for pair in ((a, b), (b, a))}
+    first, second = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
+    kept = np.ones(len(pairs), bool)
+    weights = make_taper(taper, even.Nfreqs) ** 2
+    for hand in range(even.Npols):
+        # Few patterns of flags are different.
+        found = [np.unique(~uvd.flag_array[..., hand], axis=0, return_inverse=True) for uvd in (even, odd)]
+        (of_even, index), (of_odd, other) = ((used.astype(float), place.ravel()) for used, place in found)
+        common = (of_even * weights) @ of_odd.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            noise = np.sqrt(np.outer(of_even @ weights, of_odd @ weights)) / common
+        kept &= noise[index[first], other[second]] < MOST_NOISE
+    if not kept.any():
+        raise InputError(
+            "power: no pair of baselines has data in the same channels and in all polarizations of even and odd data; "
+            "select one polarization, or the channels that most antennas have"
+        )
+    if not kept.all():
+        logger.warning(
+            "%d of %d pairs of baselines are left out of power spectra: flagged, or with too few channels in common",
+            np.sum(~kept),
+            len(pairs),
+        )
+    return [pair for pair, is_kept in zip(pairs, kept, strict=True) if is_kept]
 
 
 def _to_millikelvin(uvd: UVData, angles: dict[int, tuple[np.ndarray, np.ndarray]]) -> UVData:

@@ -12,7 +12,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.feeds import x_in_file
 from calstudy.base.gains import gain_products
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
-from calstudy.base.visibilities import antenna_pairs, flag_cube, from_cube, rows_of, to_cube
+from calstudy.base.visibilities import antenna_pairs, crosses_of, flag_cube, from_cube, rows_of, to_cube
 from calstudy.calibrate.interface import Calibrator
 from calstudy.calibrate.settings import GainFit
 from calstudy.calibrate.sky_model import common_baselines
@@ -306,12 +306,6 @@ class ObservedAverage(InBlocks, stage="observed-average", version=2):
         size = size_of(self)
         disk = 2 * self.blocks * size.samples / size.times * COMPLEX128
         return Cost(2 + size.samples * 5e-7, LIBRARIES_MEMORY + 10 * size.samples * COMPLEX128, disk)
-
-
-def crosses_of(data: UVData) -> UVData:
-    """Return the cross-correlations of rectangular, time-major data."""
-    crosses = np.flatnonzero(data.ant_1_array != data.ant_2_array)
-    return data.select(blt_inds=crosses, inplace=False, run_check=False)
 
 
 def _variances(data: UVData, pairs: np.ndarray) -> np.ndarray | None:

@@ -14,6 +14,7 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.visibilities import (
     antenna_pairs,
     baseline_vectors,
+    crosses_of,
     from_cube,
     positions,
     rows_of,
@@ -43,9 +44,9 @@ from calstudy.products.files import (
     write_visibilities,
 )
 from calstudy.products.graph import MeasuredGraph, memoize, size_of
-from calstudy.products.observed import average, calibrated, crosses_of, observed, read_observed
+from calstudy.products.observed import average, calibrated, observed, read_observed
 from calstudy.products.observed_results import observed_spectra
-from calstudy.products.signal_loss import Difference, Injected, write_corrected, write_transfer
+from calstudy.products.signal_loss import Injected, difference, write_corrected, write_transfer
 from calstudy.products.spectra import EXCISION, InBlocks, cross_power
 from calstudy.products.table import StudyTable
 from calstudy.realdata.halves import PARITIES
@@ -104,9 +105,8 @@ def transfer(graph: MeasuredGraph) -> Task | None:
         injected = Inject(f"data + eor {parity}", data=observed(graph, parity), **_added(graph, parity))
         blocks = graph.parts.averaging(graph.experiment.power, parity)
         signals.append(AverageEor(f"eor {parity}", **_added(graph, parity), **blocks))
-        own, with_signal = (average(graph, "residual", parity, data) for data in (None, injected))
-        label = f"response to the eor {parity}"
-        responses.append(Difference(label, with_signal=with_signal, without_signal=own))
+        averages = [average(graph, "residual", parity, data) for data in (injected, None)]
+        responses.append(difference(f"response to the eor {parity}", averages, "calibration"))
     return ObservedTransfer(
         "signal loss",
         power=graph.experiment.power,

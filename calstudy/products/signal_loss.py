@@ -14,6 +14,7 @@ import numpy as np
 from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table
+from calstudy.base.visibilities import crosses_of
 from calstudy.experiment.model import SIGNAL_LOSS_VARIANTS
 from calstudy.power.binned import make_bin_edges
 from calstudy.power.delay import make_taper
@@ -38,6 +39,7 @@ from calstudy.products.calibration import in_words
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     AVERAGE,
+    RESIDUAL,
     SCORE,
     TRANSFER,
     TRANSFER_BANDS,
@@ -48,7 +50,7 @@ from calstudy.products.files import (
     write_visibilities,
 )
 from calstudy.products.graph import Graph, memoize, size_of
-from calstudy.products.spectra import blocks_in
+from calstudy.products.spectra import InBlocks, blocks_in
 from calstudy.products.table import StudyTable
 from calstudy.run.task import Input, Inputs, Task
 from calstudy.verdicts.standing import marked, why_not_measured
@@ -75,10 +77,8 @@ def transfer(graph: Graph) -> Transfer | None:
     residual, without, eor = (graph.experiment.variants[name] for name in SIGNAL_LOSS_VARIANTS)
     label = "response to the EoR"
     responses = [
-        Difference(
-            f"{label} {parity}",
-            with_signal=spectra.average(graph, residual, parity),
-            without_signal=spectra.average(graph, without, parity),
+        difference(
+            f"{label} {parity}", [spectra.average(graph, variant, parity) for variant in (residual, without)], "data"
         )
         for parity in PARITIES
     ]
@@ -121,21 +121,52 @@ class TransferTable(StudyTable):
         return [transfer(graph)]
 
 
-class Difference(Task, stage="difference", version=2):
-    """The response of an averaged residual to the signal."""
+def difference(label: str, averages: Sequence[Task], source: str) -> Task:
+    """Return the task of the response to a signal, from averages of residuals with and without it, in this order.
+
+    `source` is the input of the averages that is the calibration.
+    """
+    with_signal, without_signal = averages
+    blocks: dict[str, Any] = {name: getattr(with_signal, name) for name in ("blocks", "centre", "span", "kept")}
+    calibrations = {"with": with_signal.inputs[source], "without": without_signal.inputs[source]}
+    return Difference(
+        label, with_signal=with_signal, without_signal=without_signal, calibrations=calibrations, **blocks
+    )
+
+
+class Difference(InBlocks, stage="difference", version=3):
+    """The response of a residual to the signal, averaged."""
 
     with_signal: Input
     without_signal: Input
+    calibrations: Inputs
 
     def make(self, output: Path) -> Mapping[str, Any]:
-        """Write the response to average.uvh5."""
-        found = (read_visibilities(folder / AVERAGE) for folder in (self.with_signal, self.without_signal))
-        write_visibilities(signal_response(*found), output / AVERAGE)
-        return {}
+        """Write the response to average.uvh5.
+
+        Where other samples have gains with the signal than without it, both have the flags of either before they are
+        averaged: foregrounds and noise would not cancel in a difference of averages.
+        """
+        from calstudy.power.average import average_in_blocks
+
+        averages = [read_visibilities(folder / AVERAGE) for folder in (self.with_signal, self.without_signal)]
+        first, second = (average.nsample_array for average in averages)
+        response, warnings = signal_response(*averages), []
+        if not np.allclose(first, second):
+            found = signal_response(*(read_visibilities(folder / RESIDUAL) for folder in self.calibrations.values()))
+            found = crosses_of(found)
+            found.data_array[found.flag_array] = 0
+            response = average_in_blocks(found, self.blocks_of(found))
+            part = 1 - float(np.mean(response.nsample_array) / np.mean(first))
+            warnings = [
+                f"{part:.2%} of the samples are left out of T: they have gains only with the EoR, or only without"
+            ]
+        write_visibilities(response, output / AVERAGE)
+        return {"warnings": warnings}
 
     def _cost(self) -> Cost:
-        blocks = blocks_in(self.inputs.values())
-        return Cost(0.1 * blocks, disk=blocks * size_of(self).baselines * 1e4)
+        size, blocks = size_of(self), blocks_in([self.with_signal, self.without_signal])
+        return Cost(0.1 * blocks, LIBRARIES_MEMORY + 8 * size.samples * COMPLEX128, disk=blocks * size.baselines * 1e4)
 
 
 def read_calibrated(folders: Mapping[str, Path]) -> CalibratedSpectra:

@@ -17,6 +17,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from numbers import Integral
 from pathlib import Path
+from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
 from pydantic_core import to_jsonable_python
@@ -165,14 +166,44 @@ def _is_of_other_code(product: Product, order: WorkOrder, store: Store) -> bool:
     return bool(product.record["lineage"] != lineage(order.made_with, inputs))
 
 
+class _Collector(logging.Handler):
+    """Keeps the warnings that are logged in one thread."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.thread = get_ident()
+        self.sentences: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the text of a record."""
+        if record.thread == self.thread:
+            self.sentences.append(record.getMessage())
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Collect the warnings that the package logs in this thread within the block."""
+    collector, package = _Collector(), logging.getLogger("calstudy")
+    package.addHandler(collector)
+    try:
+        yield collector.sentences
+    finally:
+        package.removeHandler(collector)
+
+
 def _make(order: WorkOrder, store: Store) -> Product:
+    from threadpoolctl import threadpool_limits
+
     _require_room(order)
     task, inputs = order.task, _verified_inputs(order, store)
     started = datetime.now(UTC)
     logging.captureWarnings(True)
     with store.building(task.stage.name, order.key) as folder:
-        with Usage() as usage:
+        # Most products of matrices are many and small: threads in each cost more than they gain.
+        with Usage() as usage, _warnings() as found, threadpool_limits(limits=1, user_api="blas"):
             notes = task.given({name: product.path for name, product in inputs.items()}).make(folder)
+        if found:
+            notes = {**notes, "warnings": [*notes.get("warnings", ()), *dict.fromkeys(found)]}
         _require_unchanged(order)
         own = made_with(task)
         record = {

@@ -27,7 +27,6 @@ import numba
 import numpy as np
 from pyradiosky import SkyModel
 from pyuvdata import UVData
-from threadpoolctl import threadpool_limits
 
 from calstudy.base.constants import SPEED_OF_LIGHT
 from calstudy.base.visibilities import antenna_indices, baseline_vectors, require_rectangular
@@ -76,20 +75,18 @@ def visibilities(
     tracks = SourceTracks.of(sky, template.telescope.location, times)
     always_up, crossing = split_by_horizon(tracks, times)
     total = np.zeros((template.Nfreqs, len(common.nodes), template.Npols, template.Nbls), dtype=np.complex128)
-    # The products are many and small: threads in each cost more than they gain, and workers share the cores.
-    with threadpool_limits(limits=1, user_api="blas"):
-        if len(always_up):
-            steady = Patches(sky, tracks, always_up, array.choose_nside(sky.Ncomponents, common.nodes, dtype))
-            patches = PatchSum(array, sky, steady, dtype)
-            for place, tolerance in enumerate(array.tolerances(steady, sky)):
-                axis = array.time_nodes(steady.radii[place], float(tolerance), common.nodes)
-                patches.add(total, place, axis, common.nodes)
-        # Axes: integrations, channels, feeds, baselines.
-        cube = common.interpolate(total.swapaxes(0, 1))
-        if len(crossing):
-            # They are few, and simulated at every integration: one patch is enough.
-            patches = PatchSum(array, sky, Patches(sky, tracks, crossing, nside=0), dtype)
-            patches.add(cube.swapaxes(0, 1), 0, Axis(times, np.eye(len(times))), times)
+    if len(always_up):
+        steady = Patches(sky, tracks, always_up, array.choose_nside(sky.Ncomponents, common.nodes, dtype))
+        patches = PatchSum(array, sky, steady, dtype)
+        for place, tolerance in enumerate(array.tolerances(steady, sky)):
+            axis = array.time_nodes(steady.radii[place], float(tolerance), common.nodes)
+            patches.add(total, place, axis, common.nodes)
+    # Axes: integrations, channels, feeds, baselines.
+    cube = common.interpolate(total.swapaxes(0, 1))
+    if len(crossing):
+        # They are few, and simulated at every integration: one patch is enough.
+        patches = PatchSum(array, sky, Patches(sky, tracks, crossing, nside=0), dtype)
+        patches.add(cube.swapaxes(0, 1), 0, Axis(times, np.eye(len(times))), times)
     return np.ascontiguousarray(cube.transpose(0, 3, 1, 2))
 
 

@@ -1,0 +1,54 @@
+"""The signal loss where some samples have gains in data with the EoR, and others in data without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tiny import tiny
+
+import calstudy
+from calstudy.report.page import recorded_warnings
+from calstudy.results.reader import RunFolder
+
+CODE = """
+import dataclasses, hashlib
+
+import numpy as np
+
+from calstudy.calibrate.calibrators.given_gains import NoCalibration
+
+
+class Some(NoCalibration):
+    calibrator: str = "some.py"
+
+    def calibrate(self, observation, assumed, progress=None):
+        found = super().calibrate(observation, assumed, progress)
+        flags = np.zeros(found.gains.shape, bool)
+        digest = hashlib.sha256(np.ascontiguousarray(observation.visibilities)).digest()
+        random = np.random.default_rng(list(digest))
+        for time in range(flags.shape[2]):
+            flags[:, random.choice(flags.shape[1], 2, replace=False), time] = True
+        return dataclasses.replace(found, gain_flags=flags)
+"""
+
+
+@pytest.mark.chain
+def test_solves_that_fail_with_the_eor_alone_leave_neither_noise_nor_foregrounds_in_t(tmp_path):
+    """All gains are one, so that T is one; the foregrounds that are left are a hundred times the EoR."""
+    (tmp_path / "some.py").write_text(CODE)
+    found = {}
+    for name in ("none", str(tmp_path / "some.py")):
+        content = tiny(tmp_path)
+        content["instrument"]["times"]["count"] = 6
+        content["corruption"]["effects"] = []
+        content["calibration"] = {"calibrator": name, "assumed": {"sky.foregrounds.count": 50}}
+        content["outputs"]["figures"] = []
+        found[name] = calstudy.load(content).run(workers=1)
+    whole, part = found.values()
+    for run in (whole, part):
+        transfer = run.scores["transfer"].to_numpy(float)
+        assert np.isfinite(transfer).sum() >= 2
+        # A twelfth of the samples is missing, not the same in the EoR and in its response.
+        np.testing.assert_allclose(transfer[np.isfinite(transfer)], 1, atol=0.1)
+    said = [recorded_warnings(RunFolder(run.folder).products) for run in (whole, part)]
+    assert [any("of the samples are left out of T: they" in text for text in one) for one in said] == [False, True]
