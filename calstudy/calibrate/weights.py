@@ -18,8 +18,9 @@ from calstudy.base.errors import InputError
 from calstudy.base.feeds import with_feeds_of
 from calstudy.base.foreign_files import require_self_contained
 from calstudy.base.observation import Observation
-from calstudy.base.visibilities import positions
-from calstudy.calibrate.settings import NOISE_UNKNOWN, FileWeights, ForegroundFit, Weights
+from calstudy.base.visibilities import polarization_names, positions
+from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.settings import NOISE_UNKNOWN, FileWeights, ForegroundFit, WeightedFit, Weights
 
 # Times of weights and data agree within this, in days.
 TIME_TOLERANCE = 1e-6
@@ -27,6 +28,14 @@ FAR = 30.0
 """Amplitudes of an antenna this many times the median of the antennas, or less than its inverse, are reported."""
 FEW = 0.05
 """With data in a smaller fraction of the channels, a fit of foregrounds and gains is unreliable; this is reported."""
+MUCH = 0.05
+"""A larger fraction of the unflagged samples that has no weight is reported."""
+WEIGHTLESS = {
+    "nsamples": "their numbers of samples are zero; correct them",
+    "autos": "autocorrelations are flagged or not positive; repair or unflag them",
+    "file": "the file has weights of zero; change it",
+}
+"""Why unflagged samples have no weight by a kind of weights, and the remedy."""
 
 
 def make_weights(
@@ -179,8 +188,11 @@ def dead_samples(data: Observation, chosen: np.ndarray) -> np.ndarray:
     return zero & ~(first & second)
 
 
-def conspicuous(data: Observation) -> list[str]:
-    """Describe antennas that are zero throughout or have outlying amplitudes, and integrations with few channels."""
+def conspicuous(data: Observation, calibrator: Calibrator | None = None) -> list[str]:
+    """Describe antennas that are lost, zero or have outlying amplitudes, and integrations with few channels.
+
+    Antennas may be lost by the weights of the calibrator.
+    """
     crosses = ~data.autos
     dead, antennas = dead_samples(data, crosses), data.antennas[crosses]
     live = ~data.flags[:, crosses] & ~dead
@@ -199,6 +211,9 @@ def conspicuous(data: Observation) -> list[str]:
     if dead.any():
         whole = f", all that there are of antenna(s) {', '.join(zeros)}" if zeros else ""
         found = [f"{dead.sum()} samples are exactly zero, as all of an antenna then, and count as flagged{whole}."]
+    found += _flagged(data, crosses)
+    if isinstance(calibrator, WeightedFit) and calibrator.weights.kind in WEIGHTLESS:
+        found += _weightless(data, crosses, live, calibrator.weights)
     median = np.nanmedian(own) if np.isfinite(own).any() else np.nan
     for antenna in np.flatnonzero((own > FAR * median) | (own < median / FAR)).tolist():
         found.append(
@@ -214,3 +229,41 @@ def conspicuous(data: Observation) -> list[str]:
             "together with foregrounds mean nothing there."
         )
     return found
+
+
+def _flagged(data: Observation, crosses: np.ndarray) -> list[str]:
+    """Name antennas whose cross-correlations are all flagged, of polarizations with others that are not."""
+    have_data = _in(data, crosses, ~data.flags[:, crosses])
+    flagged = _in(data, crosses, np.ones_like(data.flags[:, crosses])) & ~have_data & have_data.any(axis=0)
+    if not flagged.any():
+        return []
+    return [f"All visibilities of antenna(s) {_named(data, flagged)} are flagged, in {data.n_times} integration(s)."]
+
+
+def _weightless(data: Observation, crosses: np.ndarray, live: np.ndarray, settings: Weights) -> list[str]:
+    """Tell how many samples of cross-correlations with data have no weight, and name antennas that keep none."""
+    weighted = make_weights(data, crosses, settings) > 0
+    lost = _in(data, crosses, live) & ~_in(data, crosses, weighted)
+    fraction = 1 - weighted.sum() / max(live.sum(), 1)
+    if not lost.any() and not live.any() * fraction > MUCH:
+        return []
+    whole = f", all of antenna(s) {_named(data, lost)} among them" if lost.any() else ""
+    return [
+        f"{100 * fraction:.2g} % of the unflagged samples have no weight by weights: {settings.kind}, and count as "
+        f"flagged{whole}: {WEIGHTLESS[settings.kind]}, or use weights: gains or flags."
+    ]
+
+
+def _in(data: Observation, crosses: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Return which antennas have some of the samples of cross-correlations in a polarization, (Nants, Npols)."""
+    used = np.zeros((data.n_baselines, data.n_polarizations), bool)
+    used[crosses] = samples.any(axis=(0, 2))
+    return data.antennas_of(used)
+
+
+def _named(data: Observation, chosen: np.ndarray) -> str:
+    """Return the numbers of antennas, with the polarizations where these are not all, of a mask (Nants, Npols)."""
+    names = []
+    for number, own in zip(data.numbers[chosen.any(axis=1)], chosen[chosen.any(axis=1)], strict=True):
+        names.append(str(number) if own.all() else f"{number} ({polarization_names(data.polarizations[own])})")
+    return ", ".join(names)

@@ -152,7 +152,7 @@ class Calibrated(Task):
         return data, sky, None if self.levels is None else read_noise(self.levels)
 
 
-class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
+class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=7):
     """The calibration of a run of consecutive integrations."""
 
     calibration: Calibrator
@@ -166,7 +166,7 @@ class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
         together = self.calibration.integrations_per_solve
         times = _times_of_chunk(self.data / DATA, self.index, self.count, together)
         data, sky, noise = self.read(times)
-        remarks = conspicuous(Observation(data))
+        remarks = conspicuous(Observation(data), self.calibration)
         result = run_calibrator(self.calibration, data, sky, noise=noise)
         result.gains.write_calh5(output / GAINS)
         for name, uvd in ((MODEL, result.model), (RESIDUAL, result.residual)):

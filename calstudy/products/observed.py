@@ -260,7 +260,7 @@ def read_observed(folder: Path, calibrator: Calibrator, sky_model: bool) -> tupl
     return read_visibilities(folder / DATA), sky, read_noise(folder) if calibrator.needs_noise else None
 
 
-class ObservedAverage(InBlocks, stage="observed-average", version=2):
+class ObservedAverage(InBlocks, stage="observed-average", version=3):
     """The average of one half; all averages have the samples, flags and baselines of the residual."""
 
     what: str

@@ -123,16 +123,17 @@ def _weights(uvd: UVData) -> np.ndarray:
 def noise_of_average(variance: np.ndarray, uvd: UVData, times: np.ndarray) -> np.ndarray:
     """Return sigma of the average over some integrations, (Nbls, Nfreqs, Npols); NaN where no variance is known.
 
-    `variance` is sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols), NaN where it is not known: there it is taken to
-    be the mean of the known ones. The numbers of samples in `uvd` are the weights, of unflagged samples only. `times`
-    are indices of integrations, (n,).
+    `variance` is sigma^2 of each sample, (Ntimes, Nbls, Nfreqs, Npols), NaN where it is not known: there that of a
+    single measurement is taken to be the mean over the measurements in known samples. The numbers of samples in `uvd`
+    are the weights, of unflagged samples only. `times` are indices of integrations, (n,).
     """
     weights = np.where(flag_cube(uvd), 0, uvd.nsample_array.reshape(variance.shape))[times]
     variance = variance[times]
     known = np.where(np.isfinite(variance), weights, 0)
-    squares, total = np.sum(known**2, axis=0), weights.sum(axis=0)
-    mean = np.sum(np.where(known > 0, known**2 * variance, 0), axis=0) / np.where(squares > 0, squares, np.nan)
-    return np.sqrt(mean * np.sum(weights**2, axis=0)) / np.where(total > 0, total, np.nan)
+    squares = np.sum(np.where(known > 0, known**2 * variance, 0), axis=0)
+    # Sums of w^2 sigma^2 grow as the number w of measurements: those of unknown noise enlarge them by as much.
+    counts = known.sum(axis=0) * weights.sum(axis=0)
+    return np.sqrt(squares / np.where(counts > 0, counts, np.nan))
 
 
 def noise_of_baselines(noise: DelaySpectra, buffer: float, everywhere: bool) -> np.ndarray:

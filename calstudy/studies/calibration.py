@@ -250,7 +250,7 @@ class DataCalibration(DataStudy):
 
         data, _, notes = observed(self.graph, WHOLE).read()
         observation, calibrator = Observation(data), self.file.calibration
-        doubts = conspicuous(observation)
+        doubts = conspicuous(observation, calibrator)
         if isinstance(calibrator, WeightedFit):
             fitted = fitted_baselines(observation, getattr(calibrator, "autos", False))
             if not make_weights(observation, fitted, calibrator.weights).any():

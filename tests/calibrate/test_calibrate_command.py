@@ -432,6 +432,20 @@ def test_a_dry_run_says_where_no_sample_has_a_weight(command, tmp_path):
     assert "Every sample is flagged or has no weight by weights: autos" in told
 
 
+def test_antennas_that_are_flagged_or_lost_by_their_autocorrelations_are_told_with_the_results(command, tmp_path):
+    uvd = with_autos(make_uvdata(make_toy(scattered(6)), 1), power=10.0)
+    one, other = np.unique(uvd.ant_1_array)[:2].tolist()
+    uvd.flag_array[(uvd.ant_1_array == one) & (uvd.ant_2_array == one)] = True
+    uvd.flag_array[(uvd.ant_1_array == other) ^ (uvd.ant_2_array == other)] = True
+    uvd.write_uvh5(str(tmp_path / "data.uvh5"))
+    code, told = command("data.uvh5", *OPTIONS, "--weights", "autos", "--no-gain-errors", "--output", "out")
+    assert code == 0, told
+    warnings = json.loads((tmp_path / "out" / "solution.json").read_text())["warnings"]
+    for text in (f"All visibilities of antenna(s) {other} are flagged", f"all of antenna(s) {one} among them"):
+        assert any(text in warning for warning in warnings), warnings
+        assert text in told
+
+
 def test_what_the_memory_does_not_hold_is_refused(command, data, tmp_path):
     code, error = command(data, *OPTIONS, "--output", "out", "--max-memory", "500 MB")
     assert code == 2

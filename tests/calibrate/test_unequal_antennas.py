@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from observations import with_autos
 from toy import make_toy, scattered
 from toy_data import make_uvdata
 
@@ -53,6 +54,56 @@ def test_a_dead_antenna_is_flagged_and_named_and_leaves_the_others_alone():
     touching = (found.residual.ant_1_array == LOUD) | (found.residual.ant_2_array == LOUD)
     assert found.residual.flag_array[touching].all()
     assert not found.residual.flag_array[~touching].any()
+
+
+def with_flags(antenna, autos, polarizations=(-5,)):
+    """Return data with autocorrelations, of which those or the other visibilities of an antenna are flagged."""
+    uvd = with_autos(make_uvdata(make_toy(scattered(6)), 1, polarizations), power=10.0)
+    first, second = uvd.ant_1_array == antenna, uvd.ant_2_array == antenna
+    uvd.flag_array[first & second if autos else first ^ second] = True
+    return uvd
+
+
+def test_an_antenna_that_is_lost_by_its_flagged_autocorrelations_is_named():
+    """Weights from autocorrelations take its gains as its flags would; other weights solve for them."""
+    uvd, flagged = with_flags(LOUD, autos=True), with_flags(LOUD, autos=False)
+    by_autos, by_flags = ({"calibrator": "calamity", "weights": kind} for kind in ("autos", "flags"))
+    # Five of the fifteen baselines.
+    assert conspicuous(Observation(uvd), CALIBRATORS.make(by_autos)) == [
+        "33 % of the unflagged samples have no weight by weights: autos, and count as flagged, all of antenna(s) "
+        f"{LOUD} among them: autocorrelations are flagged or not positive; repair or unflag them, or use weights: "
+        "gains or flags."
+    ]
+    assert conspicuous(Observation(uvd), CALIBRATORS.make(by_flags)) == []
+    lost, told, solved = calibrated(uvd, weights="autos"), calibrated(flagged, weights="autos"), calibrated(uvd)
+    antenna = lost.gains.ant_array == LOUD
+    assert lost.gains.flag_array[antenna].all()
+    assert not lost.gains.flag_array[~antenna].any()
+    np.testing.assert_array_equal(lost.gains.gain_array, told.gains.gain_array)
+    assert not solved.gains.flag_array[antenna].any()
+
+
+def test_autocorrelations_that_are_flagged_in_part_take_samples_in_silence_only_if_they_are_few():
+    uvd, calibrator = with_flags(LOUD, autos=False), CALIBRATORS.make({"calibrator": "calamity", "weights": "autos"})
+    uvd.flag_array[:] = False
+    autos = uvd.ant_1_array == uvd.ant_2_array
+    uvd.flag_array[autos, :2] = True
+    assert conspicuous(Observation(uvd), calibrator) == []
+    uvd.flag_array[autos, :16] = True
+    [told] = conspicuous(Observation(uvd), calibrator)
+    assert told.startswith("25 % of the unflagged samples have no weight by weights: autos, and count as flagged: auto")
+
+
+def test_a_flagged_antenna_is_named_with_its_polarization():
+    uvd = with_flags(LOUD, autos=False, polarizations=(-5, -6))
+    [told] = conspicuous(Observation(uvd))
+    assert told == f"All visibilities of antenna(s) {LOUD} are flagged, in 1 integration(s)."
+    uvd.flag_array[..., 0] = False
+    [told] = conspicuous(Observation(uvd))
+    assert told == f"All visibilities of antenna(s) {LOUD} (yy) are flagged, in 1 integration(s)."
+    # Where all antennas are, none stands out.
+    uvd.flag_array[..., 1] = True
+    assert conspicuous(Observation(uvd)) == []
 
 
 def test_zeros_of_one_baseline_are_data():

@@ -456,6 +456,24 @@ def test_noise_of_an_average_weighs_variances_by_the_squares_of_the_numbers_of_s
     np.testing.assert_allclose(noise_of_average(variance, data, np.arange(2)), np.sqrt(13 / 16))
 
 
+def test_samples_of_unknown_noise_have_that_of_their_own_numbers_of_measurements(observe, white):
+    """Averages of samples of variance 9 / n scatter as it says they do, whichever of the samples are known."""
+    template, rng = observe(HexLayout(kind="hex", side=3), n_channels=64, n_times=8), np.random.default_rng(5)
+    shape = (8, template.Nbls, 64, 1)
+    counts = rng.uniform(0.05, 2.0, shape)
+    data = white(template, rng, sigma=3.0)
+    samples = to_cube(data) / np.sqrt(counts)
+    data.nsample_array = counts.reshape(data.nsample_array.shape)
+    unknown = rng.uniform(size=shape) < 0.5
+    found = noise_of_average(np.where(unknown, np.nan, 9.0 / counts), data, np.arange(8))
+    whole = noise_of_average(9.0 / counts, data, np.arange(8))
+    known = ~unknown.all(axis=0)
+    np.testing.assert_allclose(found[known], whole[known], rtol=1e-12)
+    averages = np.average(samples, axis=0, weights=counts)[known]
+    # Some 10,000 averages: known to 1 %, and the limit is four times that.
+    assert np.mean(np.abs(averages / found[known]) ** 2) == pytest.approx(1.0, rel=0.04)
+
+
 def test_the_difference_of_unequal_halves_has_the_power_of_the_noise_of_their_product(observe, white):
     template, rng = observe(HexLayout(kind="hex", side=3), n_channels=64), np.random.default_rng(3)
     even, odd = white(template, rng, sigma=1.0), white(template, rng, sigma=0.5)
