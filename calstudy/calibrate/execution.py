@@ -392,9 +392,9 @@ class _Returned:
             if smoothing.reference_antenna is None:
                 gains = np.where(self.gain_flags, 1, smoothly_turned(np.where(self.gain_flags, 0, gains)))
             gains = smooth(gains, self.gain_flags, self.fitted, smoothing)
-        residual = self._residual(gains, flags)
         template = self.fitted.uvd
-        model = self.model if self.closure is None else self.closure * self.model
+        residual = self._real_autos(self._residual(gains, flags))
+        model = self._real_autos(self.model if self.closure is None else self.closure * self.model)
         result = CalibrationResult(
             make_gains(template, self.fitted.numbers, gains, self.gain_flags),
             make_visibilities(template, model, flags),
@@ -422,6 +422,11 @@ class _Returned:
             calibrated = np.where(unused, 0, self.fitted.visibilities[t, :, :, p]) / products
             residual[t, :, :, p] = np.where(unused, 0, calibrated - self.model[t, :, :, p])
         return residual
+
+    def _real_autos(self, values: np.ndarray) -> np.ndarray:
+        """Return values, shaped like visibilities, with real autocorrelations: g g* is complex by rounding."""
+        autos = self.fitted.autos
+        return np.where(autos[:, None, None], values.real, values) if autos.any() else values
 
     def _records(self, usage: Usage) -> list[Solve]:
         share, cpu_share = (value / len(self.outcomes) for value in (usage.seconds, usage.cpu_seconds))

@@ -104,7 +104,7 @@ def _response(problem: CalibrationProblem, members: np.ndarray, roots: np.ndarra
     """
     prior, (own, shared) = problem.structure.prior, problem.deviations
     if prior == "none":
-        return Response(members, _orthonormal(roots, vectors))
+        return Response(members, orthonormal(roots, vectors))
     weighted = roots[:, :, None] * vectors
     if prior != "both":
         weighted = weighted * (own if prior == "own" else shared)
@@ -120,7 +120,7 @@ def _smoothing(sequences: np.ndarray, left: np.ndarray) -> np.ndarray:
     return left @ (turned / np.sqrt(1 + np.maximum(values, 0)))
 
 
-def _orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def orthonormal(roots: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis of the sequences (Nfreqs, Nvec), weighted by `roots` (Nmembers, Nfreqs)."""
     weighted = (roots[:, :, None] * vectors).reshape(-1, vectors.shape[-1])
     left, singular, _ = np.linalg.svd(weighted, full_matrices=False)

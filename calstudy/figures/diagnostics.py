@@ -268,8 +268,9 @@ def _shown_gains(result: CalibrationResult, errors: np.ndarray | None) -> tuple[
 class DiagnosticsFigure(StudyFigure):
     """Diagnostics of a calibration of measured data, of the even half or of all data."""
 
-    # Gains are drawn with their errors since 2, and polarizations named as in the file since 3.
-    version: ClassVar[int] = 3
+    # Gains are drawn with their errors since 2, polarizations named as in the file since 3, and chi^2 has no
+    # autocorrelations since 4.
+    version: ClassVar[int] = 4
     kind: str = "diagnostics"
 
     gain_errors: bool | Annotated[int, Field(ge=2)] = Field(

@@ -69,7 +69,7 @@ def solved(graph: Graph, variant: Variant, parity: str) -> dict[str, Any]:
     }
 
 
-def calibration_of(graph: Graph, inputs: Mapping[str, Task | None]) -> Task:
+def calibration_of(graph: Graph, inputs: Mapping[str, Task | None], measured: bool = False) -> Task:
     """Return the task of the calibration of any data by the calibrator of a study, with the inputs of `Calibrated`."""
     data, sky = cast(Task, inputs["data"]), inputs["sky_model"]
     # The assumed world enters only through the sky model, which is an input.
@@ -89,7 +89,7 @@ def calibration_of(graph: Graph, inputs: Mapping[str, Task | None]) -> Task:
         )
         for index in range(count)
     )
-    return Calibrate(data.label, chunk=tuple(chunks), temporary=not graph.keep_visibilities)
+    return Calibrate(data.label, chunk=tuple(chunks), measured=measured, temporary=not graph.keep_visibilities)
 
 
 def _times_of_chunk(path: Path, index: int, count: int, together: int) -> np.ndarray:
@@ -187,6 +187,7 @@ class Calibrate(Task, stage="calibrate", version=2):
     """The calibration of all integrations."""
 
     chunk: tuple[Input, ...]
+    measured: bool = False
 
     def make(self, output: Path) -> Mapping[str, Any]:
         """Join the runs of integrations into one set of gains, model, residual and records of solves."""
@@ -215,7 +216,7 @@ class Calibrate(Task, stage="calibrate", version=2):
             "by_status": by_status,
             **({"median_steps": float(np.median(steps))} if steps else {}),
             "median_seconds_per_solve": float(np.median(seconds)),
-            "warnings": remarks + _warnings(by_status, records),
+            "warnings": remarks + _warnings(by_status, records, self.measured),
         }
 
     def _cost(self) -> Cost:
@@ -223,7 +224,7 @@ class Calibrate(Task, stage="calibrate", version=2):
         return Cost(0.2 + disk * 6e-9, LIBRARIES_MEMORY + 3 * disk, disk)
 
 
-def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) -> list[str]:
+def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]], measured: bool) -> list[str]:
     unconverged = [record for record in records if record["status"] not in SETTLED]
     if not unconverged:
         return []
@@ -238,8 +239,9 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]]) ->
         )
     if 0 < lost < 1:
         sentences.append(
-            f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost; in a simulation, errors of "
-            "spectra by noise count them, and are too small by as much"
+            f"{100 * lost:.2g} % of the solves gave no gains, and their samples are lost"
+            # Measured noise is that of the difference of the halves, which lack the samples as well.
+            + ("" if measured else "; errors of spectra by noise count them, and are too small by as much")
         )
     sentences.append(
         f"{len(unconverged)} of {len(records)} solves did not converge ({in_words(by_status)}); integration "

@@ -98,7 +98,7 @@ def calibration_with(graph: MeasuredGraph, data: Task, part: str) -> Task:
     """Return the task of a calibration of data of one part, with the sky model and the noise of this part."""
     source, section, calibrator = observed(graph, part), graph.experiment.observed, graph.experiment.calibration
     sky, levels = (source if needed else None for needed in (section.sky_model is not None, calibrator.needs_noise))
-    return calibration_of(graph, {"data": data, "sky_model": sky, "levels": levels})
+    return calibration_of(graph, {"data": data, "sky_model": sky, "levels": levels}, measured=True)
 
 
 @memoize

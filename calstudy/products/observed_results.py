@@ -188,7 +188,7 @@ def _shown(ratio: Mapping[str, float | None] | None) -> str:
     return f"{ratio['mean']:.3f} " + ("(error not known)" if error is None else f"± {error:.3f}")
 
 
-class ObservedQuality(Task, stage="observed-quality", version=3):
+class ObservedQuality(Task, stage="observed-quality", version=4):
     """The quality of a calibration: chi^2 against the noise, and outliers."""
 
     calibrator: Calibrator = called("calibration")

@@ -25,6 +25,7 @@ from calstudy.base.visibilities import (
 )
 from calstudy.calibrate.records import CalibrationResult
 from calstudy.calibrate.settings import ForegroundFit, GainFit
+from calstudy.calibrate.tangent_space import orthonormal
 from calstudy.realdata.noise import MEDIAN_OVER_MEAN, radiometer_variance
 
 if TYPE_CHECKING:
@@ -150,9 +151,10 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     The noise is that of the radiometer equation, sigma^2 = V_aa V_bb / (channel width x integration time x nsamples),
     if the data have the autocorrelations of all calibrated antennas. Otherwise it is the median of |V - g g* F|, the
     same for all samples, and chi^2 only shows which parts are worse than others. `data` are those of
-    `calstudy.calibrate.execution.run_calibrator`, and `polarization` is an index.
+    `calstudy.calibrate.execution.run_calibrator`, and `polarization` is an index. Autocorrelations, whose noise is
+    another, are left out.
     """
-    gains, pairs = result.gains, antenna_pairs(result.model)
+    gains, (crosses, pairs) = result.gains, _crosses_of(result.model)
     numbers = np.unique(pairs)
     rows = positions(gains.ant_array, numbers)
     flags = gains.flag_array[rows, :, :, polarization]
@@ -160,8 +162,8 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     by_channel, by_antenna = _gain_ratios(np.abs(values))
     first, second = np.searchsorted(numbers, pairs).T
     products = gain_products(gains, pairs)[0][..., polarization]
-    unused = flag_cube(result.residual)[..., polarization]
-    power = np.abs(np.where(unused, np.nan, to_cube(result.residual)[..., polarization] * products)) ** 2
+    unused, residual = (of(result.residual)[..., polarization][:, crosses] for of in (flag_cube, to_cube))
+    power = np.abs(np.where(unused, np.nan, residual * products)) ** 2
     measured = np.where(unused, np.nan, np.abs(to_cube(data)[..., polarization][:, rows_of(data, pairs)]))
     brightness = np.ma.median(np.ma.masked_invalid(measured), axis=(0, 1)).filled(np.nan)
     variance = radiometer_variance(data, pairs, polarization)
@@ -188,6 +190,13 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     )
 
 
+def _crosses_of(data: UVData) -> tuple[np.ndarray, np.ndarray]:
+    """Return which baselines are cross-correlations, bool, (Nbls,), and the antenna numbers of these, (N, 2)."""
+    pairs = antenna_pairs(data)
+    crosses = pairs[:, 0] != pairs[:, 1]
+    return crosses, pairs[crosses]
+
+
 def _mean(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
     """Return the mean of finite values over all axes but those kept, NaN where there is none."""
     axes = tuple(axis for axis in range(values.ndim) if axis not in kept)
@@ -203,20 +212,34 @@ def _gain_ratios(amplitudes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def count_unknowns(problem: CalibrationProblem, settings: GainFit) -> float | None:
-    """Return the number of complex unknowns of a fit that the data determine; None if a prior determines some.
+    """Return the number of complex unknowns of a fit that cross-correlations determine; None if others determine some.
 
-    Unknowns of channels and antennas without data are left out, and the phase of each channel, which nothing
-    determines. The overall scale is one real number and is not counted.
+    Others are a prior and autocorrelations. Unknowns without data are left out, of an antenna in a channel or of a
+    foreground model, and so is the phase of each channel, which nothing determines. The overall scale is one real
+    number and is not counted.
     """
     structure = problem.structure
-    if isinstance(settings, ForegroundFit) and settings.foreground_prior.finite:
+    if settings.autos or (isinstance(settings, ForegroundFit) and settings.foreground_prior.finite):
         return None
-    used = problem.weights > 0
-    antennas = np.unique(structure.antennas[used.any(axis=1)]).size
-    channels, vectors = used.any(axis=0), structure.gain_vectors
-    per_antenna = np.count_nonzero(channels if vectors is None else vectors[channels].any(axis=0))
-    coefficients = 0 if settings.frozen else structure.basis.n_coefficients
-    return coefficients + (antennas - 0.5) * per_antenna
+    used, has_data = problem.weights > 0, problem.antenna_weights > 0
+    phases = np.asarray(has_data.any(axis=0))
+    found = _ranks(structure.gain_vectors, has_data) - 0.5 * _ranks(structure.gain_vectors, phases)
+    modelled = np.zeros((structure.basis.n_models, structure.n_frequencies), bool)
+    np.logical_or.at(modelled, structure.groups, used)
+    buckets = () if problem.frozen else structure.basis.buckets
+    return found + sum(_ranks(bucket.vectors, modelled[bucket.members]) for bucket in buckets)
+
+
+def _ranks(vectors: np.ndarray | None, used: np.ndarray) -> int:
+    """Return the number of sequences, (Nfreqs, Nvec), that used channels, (..., Nfreqs), determine, summed over rows.
+
+    None are all channels by themselves.
+    """
+    if vectors is None:
+        return int(np.count_nonzero(used))
+    masks, counts = np.unique(np.atleast_2d(used), axis=0, return_counts=True)
+    ranks = [orthonormal(mask[None].astype(float), vectors).shape[-1] for mask in masks]
+    return int(np.dot(ranks, counts))
 
 
 def predicted(gains: UVCal, model: UVData) -> UVData:
@@ -231,14 +254,14 @@ def predicted(gains: UVCal, model: UVData) -> UVData:
 
 
 def chi_squared(data: UVData, prediction: UVData) -> tuple[float, int]:
-    """Return chi^2, the sum of |V - prediction|^2 / sigma^2, and the number of samples.
+    """Return chi^2, the sum of |V - prediction|^2 / sigma^2 over cross-correlations, and the number of samples.
 
     sigma is from the autocorrelations of `data`. The prediction is of some of the baselines, at the same times.
     """
-    pairs, total, count = antenna_pairs(prediction), 0.0, 0
+    (crosses, pairs), total, count = _crosses_of(prediction), 0.0, 0
     rows = rows_of(data, pairs)
-    misfit = np.abs(to_cube(data)[:, rows] - to_cube(prediction)) ** 2
-    unused = flag_cube(data)[:, rows] | flag_cube(prediction)
+    misfit = np.abs(to_cube(data)[:, rows] - to_cube(prediction)[:, crosses]) ** 2
+    unused = flag_cube(data)[:, rows] | flag_cube(prediction)[:, crosses]
     for pol in range(data.Npols):
         variance = radiometer_variance(data, pairs, pol)
         if variance is None:

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import run_and_read, run_command
 from observations import with_autos
 from pyuvdata import UVCal, UVData
-from toy import make_toy, scattered
-from toy_data import make_uvdata
+from toy import HEX, Toy, make_toy, scattered
+from toy_data import ONE_SOLVE, make_uvdata, sky_of
 
 from calstudy.base.errors import InputError
+from calstudy.base.visibilities import flag_cube
+from calstudy.calibrate.calibrators.given_gains import ByFile, NoCalibration
+from calstudy.calibrate.calibrators.least_squares import SkyBased
+from calstudy.calibrate.execution import run_calibrator
+from calstudy.calibrate.preparation import make_problem
 from calstudy.calibrate.records import CalibrationResult, make_gains, make_visibilities
+from calstudy.calibrate.settings import FlagWeights, GainFit
 from calstudy.calibrate.sky_model import common_baselines
 from calstudy.products import calibration as products
-from calstudy.realdata.quality import assess
+from calstudy.products.files import write_visibilities
+from calstudy.realdata.quality import assess, chi_squared, count_unknowns, predicted
 from calstudy.realdata.reading import prepare
 from calstudy.realdata.selection import Selection, select
 
@@ -24,6 +33,7 @@ OPTIONS = ["--set", "calibrator=sky-based"]
 N_TIMES, CHANNEL, NOISE = 4, 20, 0.01
 ANTENNA = 3
 """Place among the eight antennas."""
+SKY_BASED = SkyBased(weights=FlagWeights())
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +128,103 @@ def test_with_autocorrelations_chi2_is_in_units_of_the_radiometer_equation(clean
     absorbed[:, :, CHANNEL] *= 4
     (warning,) = assess(data, result_of(clean, 1e-4 * sigma * absorbed)).warnings
     assert "chi^2 is 1e-08 per sample: the fit has about as many unknowns as there are samples" in warning
+
+
+def measured(toy: Toy) -> tuple[UVData, UVData]:
+    """Return an integration of a toy with the autocorrelations that its noise has, and its sky model."""
+    crosses, rms = make_uvdata(toy, 1), np.sqrt(np.mean(np.abs(toy.noise) ** 2))
+    level = rms * np.sqrt(float(np.mean(crosses.channel_width)) * float(crosses.integration_time[0]))
+    data, sky = with_autos(crosses, level), with_autos(sky_of(crosses, toy.foregrounds), level)
+    autos = data.ant_1_array == data.ant_2_array
+    antennas = np.searchsorted(data.telescope.antenna_numbers, data.ant_1_array[autos])
+    data.data_array[autos] *= np.abs(toy.gains[antennas, :, None]) ** 2
+    return data, sky
+
+
+def given_gains(toy: Toy, folder: Path, with_model: bool) -> ByFile:
+    """Return the calibrator that has the true gains in a file, and perhaps foregrounds of cross-correlations."""
+    crosses, gains, model = make_uvdata(toy, 1), toy.gains[:, :, None, None], folder / "model.uvh5"
+    made = make_gains(crosses, crosses.telescope.antenna_numbers, gains, np.zeros(gains.shape, bool))
+    made.write_calh5(folder / "gains.calh5")
+    if with_model:
+        sky_of(crosses, toy.foregrounds).write_uvh5(model)
+    return ByFile(gains=folder / "gains.calh5", model=model if with_model else None)
+
+
+def chi2_per_sample(data: UVData, result: CalibrationResult) -> tuple[float, int]:
+    total, samples = chi_squared(data, predicted(result.gains, result.model))
+    return total / samples, samples
+
+
+def unknowns(data: UVData, sky: UVData, settings: GainFit) -> float | None:
+    fit = products.prepared_fit(settings, data, sky, None)
+    return count_unknowns(make_problem(fit, settings, slice(0, 1), 0), settings)
+
+
+@pytest.mark.parametrize("name", ["none", "by-file", "by-file with a model"])
+def test_the_true_gains_and_sky_have_a_chi2_of_one_beside_autocorrelations(name, tmp_path):
+    """Those of the sky model are zero, as where it lacks them: the receiver's power is no part of the sky."""
+    toy, calibrator = make_toy(scattered(8), noise=0.01), NoCalibration()
+    if name == "none":
+        toy = replace(toy, gains=np.ones_like(toy.gains))
+    else:
+        calibrator = given_gains(toy, tmp_path, "model" in name)
+    data, sky = measured(toy)
+    sky.data_array[sky.ant_1_array == sky.ant_2_array] = 0
+    result = run_calibrator(calibrator, data, sky)
+    mean, samples = chi2_per_sample(data, result)
+    assert samples == toy.noise.size
+    assert mean == pytest.approx(1, abs=4 / np.sqrt(samples))
+    found = assess(data, result)
+    assert np.abs(found.chi2_by_antenna - 1).max() < 4 / np.sqrt(7 * data.Nfreqs)
+    assert found.warnings == []
+
+
+@pytest.mark.parametrize("settings", [SKY_BASED, ONE_SOLVE])
+def test_calibrated_autocorrelations_are_real_and_no_part_of_chi2(settings, tmp_path):
+    """pyuvdata writes no others. They determine gains, and what the others determine is not known."""
+    calibrator = settings.model_copy(update={"autos": True})
+    data, sky = measured(make_toy(scattered(8), noise=0.01))
+    result = run_calibrator(calibrator, data, sky)
+    for name, uvd in (("model", result.model), ("residual", result.residual)):
+        write_visibilities(uvd, tmp_path / name)
+        autos = uvd.ant_1_array == uvd.ant_2_array
+        assert autos.sum() == 8
+        assert not uvd.data_array[autos].imag.any()
+        assert uvd.data_array[~autos].imag.any()
+    assert chi2_per_sample(data, result)[1] == 28 * data.Nfreqs
+    assert unknowns(data, sky, calibrator) is None
+
+
+@pytest.mark.parametrize("settings", [SKY_BASED, ONE_SOLVE])
+def test_a_flagged_antenna_counts_as_one_that_was_left_out(settings):
+    """Neither its gains nor the foregrounds of its baselines are unknowns."""
+    data, sky = measured(make_toy(HEX, noise=0.01))
+    number = int(data.telescope.antenna_numbers[ANTENNA])
+    touching = (data.ant_1_array == number) | (data.ant_2_array == number)
+    left_out = [uvd.select(blt_inds=np.flatnonzero(~touching), inplace=False) for uvd in (data, sky)]
+    data.flag_array[touching] = True
+    counts, means = [], []
+    for some, model in ((data, sky), left_out):
+        mean, samples = chi2_per_sample(some, run_calibrator(settings, some, model))
+        assert samples == 15 * data.Nfreqs
+        counts.append(unknowns(some, model, settings))
+        means.append(mean * samples / (samples - counts[-1]))
+    assert counts[0] == counts[1]
+    assert means[0] == pytest.approx(means[1], rel=1e-3)
+    assert means[0] == pytest.approx(1, abs=4 / np.sqrt(samples - counts[0]))
+
+
+@pytest.mark.parametrize("settings", [SKY_BASED, ONE_SOLVE])
+def test_chi2_per_degree_of_freedom_is_one_where_antennas_and_baselines_have_other_flags(settings):
+    data, sky = measured(make_toy(scattered(8), noise=0.01))
+    flags, pairs = flag_cube(data)[0, :, :, 0], np.column_stack([data.ant_1_array, data.ant_2_array])
+    for antenna, number in enumerate(data.telescope.antenna_numbers[:6]):
+        flags[(pairs == number).any(axis=1), 8 * antenna : 8 * antenna + 12] = True
+    flags[np.flatnonzero(np.not_equal(*pairs.T))[:3], 12:] = True
+    mean, samples = chi2_per_sample(data, run_calibrator(settings, data, sky))
+    degrees = samples - unknowns(data, sky, settings)
+    assert mean * samples / degrees == pytest.approx(1, abs=4 / np.sqrt(degrees))
 
 
 def test_a_selection_of_lengths_keeps_the_autocorrelations_that_weights_need(clean):
@@ -250,3 +357,14 @@ def test_a_field_may_be_given_as_in_an_experiment_file(files, capsys):
     status, told = run_and_read(capsys, *CALIBRATE, *options)
     assert status == 0
     assert f"{N_TIMES // 2} solves" in told.out
+
+
+def test_only_simulations_have_errors_that_count_lost_samples():
+    """Errors of measured data are from the difference of the halves, which lack the samples as well."""
+    records = [{"status": status, "integration": 0, "message": "flagged"} for status in ("skipped", "converged")]
+    told = {}
+    for measured_data in (False, True):
+        told[measured_data] = " ".join(products._warnings({"skipped": 1, "converged": 1}, records, measured_data))
+        assert "50 % of the solves gave no gains, and their samples are lost" in told[measured_data]
+    assert "too small" in told[False]
+    assert "too small" not in told[True]

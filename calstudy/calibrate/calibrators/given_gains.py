@@ -26,6 +26,7 @@ from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.schema import FOLDER, UNKEYED, Section, fault
 from calstudy.base.visibilities import to_cube
 from calstudy.calibrate.interface import NO_SKY_MODEL, Assumed, Calibration, Calibrator, Progress, Solve
+from calstudy.calibrate.problem import fitted_baselines
 from calstudy.calibrate.sky_model import read_sky_model
 from calstudy.instrument.settings import Size
 
@@ -39,8 +40,9 @@ MODEL_SUFFIXES = (".model.uvh5", ".model.uvfits", ".model.ms")
 
 
 class NoCalibration(Calibrator):
-    """All gains are one, and the sky model is subtracted."""
+    """All gains are one, and the sky model is subtracted. Autocorrelations are left out."""
 
+    version: ClassVar[int] = 2
     calibrator: str = "none"
 
     @property
@@ -58,6 +60,8 @@ class NoCalibration(Calibrator):
 
     def calibrate(self, observation: Observation, assumed: Assumed, progress: Progress | None = None) -> Calibration:
         """Return gains of one."""
+        chosen = fitted_baselines(observation, autos=False)
+        observation = observation.baselines(chosen)
         n_times, _, n_channels, n_polarizations = observation.shape
         gains = np.ones((observation.n_antennas, n_channels, n_times, n_polarizations), complex)
         count = n_polarizations * len(self.solves(n_times))
@@ -67,17 +71,17 @@ class NoCalibration(Calibrator):
         nothing = Solve("skipped", "every sample is flagged")
         solves = itertools.product(range(n_polarizations), self.solves(n_times))
         outcomes = [nothing if observation.flags[times, ..., p].all() else found for p, times in solves]
-        return Calibration(gains=gains, outcomes=outcomes)
+        return Calibration(gains=gains, outcomes=outcomes, baselines=chosen)
 
 
 class ByFile(Calibrator):
     """Gains, and optionally models of the foregrounds, that another program found for data of `calstudy export`.
 
     Gains are for one time, which holds for all, or for every integration. Without a model in the files, the sky model
-    is subtracted.
+    is subtracted. Autocorrelations are left out.
     """
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     calibrator: str = "by-file"
     chunks: int = Field(1, ge=1, description="Pieces of consecutive integrations.")
     folder: Path | None = Field(
@@ -126,7 +130,7 @@ class ByFile(Calibrator):
                 cal.require_channels(frame.n_channels)
                 return None
             width = np.diff(frame.frequencies).min() if frame.n_channels > 1 else np.min(cal.channel_width)
-            require_solutions(cal, frame.numbers, frame.frequencies, width)
+            require_solutions(cal, frame.baselines(~frame.autos).numbers, frame.frequencies, width)
         except InputError as error:
             return f"{self.gains.name}: {str(error).removeprefix('gains: ')}"
         return None
@@ -135,13 +139,15 @@ class ByFile(Calibrator):
         """Return the gains of the file at the integrations of the data."""
         if self.gains is None:
             raise InputError("by-file: needs 'gains' for data that were not exported")
+        chosen = fitted_baselines(observation, autos=False)
+        observation = observation.baselines(chosen)
         gains, flags = _gains_at(self.gains, observation)
         count = len(self.solves(observation.n_times)) * observation.n_polarizations
         if progress is not None:
             progress(count, count)
         outcome = Solve("by-file", f"gains of {self.gains.name}")
         model = None if self.model is None else to_cube(read_sky_model(self.model, observation.uvd))
-        return Calibration(gains=gains, gain_flags=flags, model=model, outcomes=[outcome] * count)
+        return Calibration(gains=gains, gain_flags=flags, model=model, outcomes=[outcome] * count, baselines=chosen)
 
 
 def _gains_at(path: Path, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
