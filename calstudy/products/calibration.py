@@ -152,7 +152,7 @@ class Calibrated(Task):
         return data, sky, None if self.levels is None else read_noise(self.levels)
 
 
-class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=7):
+class CalibrateChunk(Calibrated, stage="calibrate-chunk", version=6):
     """The calibration of a run of consecutive integrations."""
 
     calibration: Calibrator

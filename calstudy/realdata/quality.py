@@ -48,6 +48,8 @@ NOISE = (
 )
 NAMED = 6
 """Largest number of channels or antennas named in a warning; solution.json has all of them."""
+MOST_SAID = 1000
+"""Largest ratio whose size is in a warning."""
 NEIGHBOURS = 1.5
 """Largest distance of compared integrations, in integration times."""
 
@@ -142,6 +144,9 @@ def _sentence(
 
 
 def _ratio(sign: str, value: float) -> str:
+    """Return the text of a ratio; the size of gains that ran away says nothing."""
+    if value > MOST_SAID:
+        return f"below 1/{MOST_SAID}" if sign == "1/" else f"more than {MOST_SAID} x"
     return f"1/{value:.0f}" if sign == "1/" else f"{value:.0f} x" if value >= 10 else f"{value:.1f} x"
 
 
