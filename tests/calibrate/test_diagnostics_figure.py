@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calstudy.figures.diagnostics import Diagnostics, draw_diagnostics
+from calstudy.plotting.style import journal_style
 
 DRAWN = True
 
@@ -47,13 +48,15 @@ def diagnostics(last_loss: float, lowest_chi2: float, strongest: float) -> Diagn
 @pytest.mark.parametrize(("last_loss", "lowest_chi2"), [(0.5, 0.08), (0.15, 1e-4), (1e-3, 0.5)])
 def test_every_panel_has_room(last_loss, lowest_chi2):
     """Matplotlib warns, which is an error in tests, if labels leave no room for the axes."""
-    figure = draw_diagnostics(diagnostics(last_loss, lowest_chi2, strongest=20.0))
+    with journal_style():
+        figure = draw_diagnostics(diagnostics(last_loss, lowest_chi2, strongest=20.0))
     figure.canvas.draw()
     assert all(axes.bbox.height > 0.1 * figure.bbox.height for axes in figure.axes)
 
 
 def test_an_axis_of_less_than_two_decades_has_labels_between_powers_of_ten():
-    figure = draw_diagnostics(diagnostics(last_loss=0.15, lowest_chi2=0.5, strongest=20.0))
+    with journal_style():
+        figure = draw_diagnostics(diagnostics(last_loss=0.15, lowest_chi2=0.5, strongest=20.0))
     figure.canvas.draw()
     losses = next(axes for axes in figure.axes if axes.get_ylabel() == "loss / first loss")
     assert {"0.2", "0.3", "0.5"} <= {label.get_text() for label in losses.get_yminorticklabels()}
