@@ -1,12 +1,14 @@
 """Making one product: mistakes of a user end in a sentence, defects in a traceback, and neither in a hanging run."""
 
 import errno
+import logging
 import socket
 import subprocess
 import sys
 import traceback
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from types import SimpleNamespace
 
 import pytest
@@ -62,6 +64,31 @@ def test_a_product_is_made_from_its_inputs_and_pieces_and_recorded(store):
     assert product.record["notes"] == {"number": 321}
     assert product.record["inputs"] == {"first": ["number", first.key], "piece": ["number", piece.key]}
     assert product.record["stage_version"] == 1
+
+
+class Warned(Task, stage="warned"):
+    """A stage whose code logs warnings."""
+
+    warnings: tuple[str, ...]
+
+    def make(self, output: Path) -> dict:
+        logger = logging.getLogger("calstudy.power.spectra")
+        for text in ("left out", "left out", "flagged"):
+            logger.warning(text)
+        logger.info("crossing")
+        other = Thread(target=logger.warning, args=("of another thread",))
+        other.start()
+        other.join()
+        return {"number": 1, "warnings": self.warnings} if self.warnings else {"number": 1}
+
+
+def test_warnings_that_the_package_logs_are_in_the_record(store):
+    for task, expected in (
+        (Warned("one", warnings=()), ["left out", "flagged"]),
+        (Warned("two", warnings=("own",)), ["own", "left out", "flagged"]),
+    ):
+        run(task, store)
+        assert store.verify("warned", task.key).record["notes"] == {"number": 1, "warnings": expected}
 
 
 class Copied(Task, stage="copied"):
