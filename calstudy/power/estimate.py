@@ -296,13 +296,14 @@ def _usable(pairs: list[Pair], even: UVData, odd: UVData, taper: str) -> list[Pa
     kept = np.ones(len(pairs), bool)
     weights = make_taper(taper, even.Nfreqs) ** 2
     for hand in range(even.Npols):
-        # Few patterns of flags are different.
+        # Many baselines have the same flags, and many pairs the same flags of both.
         found = [np.unique(~uvd.flag_array[..., hand], axis=0, return_inverse=True) for uvd in (even, odd)]
         (of_even, index), (of_odd, other) = ((used.astype(float), place.ravel()) for used, place in found)
-        common = (of_even * weights) @ of_odd.T
+        (one, two), place = np.unique([index[first], other[second]], axis=1, return_inverse=True)
+        common = np.einsum("pf,pf->p", (of_even * weights)[one], of_odd[two])
         with np.errstate(divide="ignore", invalid="ignore"):
-            noise = np.sqrt(np.outer(of_even @ weights, of_odd @ weights)) / common
-        kept &= noise[index[first], other[second]] < MOST_NOISE
+            noise = np.sqrt((of_even @ weights)[one] * (of_odd @ weights)[two]) / common
+        kept &= noise[place.ravel()] < MOST_NOISE
     if not kept.any():
         raise InputError(
             "power: no pair of baselines has data in the same channels and in all polarizations of even and odd data; "

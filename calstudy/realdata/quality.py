@@ -159,7 +159,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     `calstudy.calibrate.execution.run_calibrator`, and `polarization` is an index. Autocorrelations, whose noise is
     another, are left out.
     """
-    gains, (crosses, pairs) = result.gains, _crosses_of(result.model)
+    gains, (crosses, pairs) = result.gains, _cross_pairs(result.model)
     numbers = np.unique(pairs)
     rows = positions(gains.ant_array, numbers)
     flags = gains.flag_array[rows, :, :, polarization]
@@ -195,7 +195,7 @@ def assess(data: UVData, result: CalibrationResult, polarization: int = 0) -> Qu
     )
 
 
-def _crosses_of(data: UVData) -> tuple[np.ndarray, np.ndarray]:
+def _cross_pairs(data: UVData) -> tuple[np.ndarray, np.ndarray]:
     """Return which baselines are cross-correlations, bool, (Nbls,), and the antenna numbers of these, (N, 2)."""
     pairs = antenna_pairs(data)
     crosses = pairs[:, 0] != pairs[:, 1]
@@ -263,7 +263,7 @@ def chi_squared(data: UVData, prediction: UVData) -> tuple[float, int]:
 
     sigma is from the autocorrelations of `data`. The prediction is of some of the baselines, at the same times.
     """
-    (crosses, pairs), total, count = _crosses_of(prediction), 0.0, 0
+    (crosses, pairs), total, count = _cross_pairs(prediction), 0.0, 0
     rows = rows_of(data, pairs)
     misfit = np.abs(to_cube(data)[:, rows] - to_cube(prediction)[:, crosses]) ** 2
     unused = flag_cube(data)[:, rows] | flag_cube(prediction)[:, crosses]
