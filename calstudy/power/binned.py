@@ -12,7 +12,8 @@ paper's sum is exact in both limits and conservative in between (sqrt(2) P_S P_N
 
 Averages have fewer independent modes than modes:
 
-- a taper correlates neighbouring delays (`calstudy.power.delay.mode_correlation`); tau and -tau are independent;
+- a taper and flags correlate neighbouring delays (`calstudy.power.delay.mode_correlation`); tau and -tau are
+  independent;
 - the n (n-1) products of different baselines of a redundant group have independent noise and the same signal:
   sigma_N falls by sqrt(n (n-1)), sigma_S not at all. The same holds for two polarizations. The product of signal and
   noise contains the noise of n baselines, and its variance falls by n;
@@ -28,7 +29,7 @@ import dataclasses
 
 import numpy as np
 
-from calstudy.power.delay import horizon_delay, mode_correlation
+from calstudy.power.delay import horizon_delay
 from calstudy.power.settings import KBins, PowerSettings
 from calstudy.power.spectra import (
     NEGLIGIBLE,
@@ -119,7 +120,7 @@ def _effective_modes(
     first, second, between_units = covariance
     weights = spectra.n_pairs.astype(float)
     between_units = between_units * weights[first] * weights[second]
-    between_delays = mode_correlation(spectra.taper, spectra.delay.size)
+    between_delays = spectra.between_delays
     variance = np.zeros(n_bins)
     for lag in np.flatnonzero(between_delays > NEGLIGIBLE):
         shifted = np.roll(bins, -lag, axis=1)

@@ -60,12 +60,15 @@ def channel_width(frequencies: np.ndarray) -> float:
     return float((frequencies[-1] - frequencies[0]) / steps.size)
 
 
-def mode_correlation(taper: str, n_channels: int) -> np.ndarray:
+def mode_correlation(taper: str, n_channels: int, weights: np.ndarray | None = None) -> np.ndarray:
     """Return the correlation of the powers of two delays of one baseline, for white Gaussian data.
 
-    A taper T mixes neighbouring delays: V~(tau) and V~(tau + m/B) have the correlation sum T^2 exp(2 pi i m n / N) over
-    sum T^2, and the powers, quadratic in Gaussian variables, the square of its modulus. The coefficients are for
-    separations of 0, 1, ... n_channels // 2 delay bins, shape (n_channels // 2 + 1,); they are periodic in n_channels.
+    A taper T mixes neighbouring delays: V~(tau) and V~(tau + m/B) have the correlation A(m) / A(0), where A(m) is
+    sum T^2 w exp(2 pi i m n / N), and the powers, products of even and odd data, the modulus of that of both. `weights`
+    w are 0 where channels are flagged, of even and odd data, (..., n_channels, 2); None if no channel is. The
+    coefficients, means over the leading axes, are for separations of 0, 1, ... n_channels // 2 delay bins, shape
+    (n_channels // 2 + 1,); they are periodic in n_channels.
     """
-    amplitude = np.abs(np.fft.rfft(make_taper(taper, n_channels) ** 2))
-    return (amplitude / amplitude[0]) ** 2
+    window = make_taper(taper, n_channels)[:, None] ** 2 * (np.ones((n_channels, 2)) if weights is None else weights)
+    amplitude = np.abs(np.fft.rfft(window, axis=-2)).prod(axis=-1)
+    return (amplitude / amplitude[..., :1]).reshape(-1, amplitude.shape[-1]).mean(axis=0)

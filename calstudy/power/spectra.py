@@ -17,7 +17,7 @@ from calstudy.base.constants import SAME_LENGTH, SPEED_OF_LIGHT
 from calstudy.base.errors import InputError
 from calstudy.base.visibilities import positions
 from calstudy.power.cosmology import k_parallel, k_perpendicular, make_cosmology
-from calstudy.power.delay import horizon_delay
+from calstudy.power.delay import horizon_delay, mode_correlation
 from calstudy.power.settings import PowerSettings
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class DelaySpectra:
     n_times, independent_times
         Number of times whose powers are averaged, each with its own noise, and number of independent skies that they
         see, at most as many (`calstudy.power.binned.independent_times`).
+    flagged_correlation : as `between_delays` where channels are flagged, mean over pairs; empty if none is
     """
 
     power: np.ndarray = field(metadata={"unit": "mK2 h-3 Mpc3"})
@@ -74,6 +75,13 @@ class DelaySpectra:
     )
     n_times: int = field(default=1, metadata={"unit": ""})
     independent_times: float = field(default=1.0, metadata={"unit": ""})
+    flagged_correlation: np.ndarray = field(default_factory=lambda: np.zeros(0), metadata={"unit": ""})
+
+    @property
+    def between_delays(self) -> np.ndarray:
+        """Correlations of the powers of delays that are 0, 1, ... Nd // 2 bins apart, (Nd // 2 + 1,)."""
+        found = self.flagged_correlation
+        return found if found.size else mode_correlation(self.taper, self.delay.size)
 
     @property
     def length(self) -> np.ndarray:
@@ -387,6 +395,7 @@ def _counterparts(spectra: DelaySpectra, other: DelaySpectra) -> np.ndarray:
 def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelaySpectra:
     """Average the spectra of several times, which see `independent` skies; raise ValueError if the units differ."""
     first = spectra[0]
+    flagged = any(one.flagged_correlation.size for one in spectra)
     if any(not np.array_equal(other.vectors, first.vectors) for other in spectra):
         raise ValueError("the spectra of several times are of different units, expected the same")
     return replace(
@@ -395,6 +404,7 @@ def average_times(spectra: Sequence[DelaySpectra], independent: float) -> DelayS
         share_power=np.mean([one.share_power for one in spectra], axis=0),
         n_times=len(spectra),
         independent_times=independent,
+        flagged_correlation=np.mean([one.between_delays for one in spectra], axis=0) if flagged else np.zeros(0),
     )
 
 
@@ -412,6 +422,9 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
     n_pairs = np.bincount(unit)
     frequency = float(uvp.freq_array.mean())
     modes = modes_of(uvp.dly_array, np.linalg.norm(vectors, axis=1), frequency, settings)
+    # hera_pspec has flags of even and odd data along the third axis, and polarizations along the last.
+    weights = np.moveaxis(uvp.wgt_array[0], -1, 1)
+    correlation = np.zeros(0) if weights.all() else mode_correlation(settings.taper, weights.shape[-2], weights)
     return DelaySpectra(
         power=power / n_pairs[:, None],
         vectors=vectors,
@@ -423,6 +436,7 @@ def delay_spectra(uvp: UVPSpec, settings: PowerSettings) -> DelaySpectra:
         frequency=frequency,
         omega_pp=float(uvp.OmegaPP.mean()),
         taper=settings.taper,
+        flagged_correlation=correlation,
         **_antenna_shares(uvp, pairs, unit),
     )
 

@@ -147,7 +147,7 @@ class Average(InBlocks, stage="average", version=2):
         return Cost(seconds, LIBRARIES_MEMORY + 6 * size.samples * COMPLEX128, disk)
 
 
-class Power(Task, stage="power", version=6):
+class Power(Task, stage="power", version=7):
     """The delay power spectra of two averages, and how much noise missing samples add."""
 
     beam: Beam

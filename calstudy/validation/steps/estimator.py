@@ -56,7 +56,7 @@ from calstudy.experiment.model import Component, Variant
 from calstudy.instrument.beams import make_beam
 from calstudy.instrument.settings import InstrumentSettings
 from calstudy.power.cosmology import make_cosmology, radial_scale, redshift, transverse_scale
-from calstudy.power.delay import make_taper, mode_correlation
+from calstudy.power.delay import make_taper
 from calstudy.power.estimate import kelvin_per_jansky
 from calstudy.power.settings import PowerSettings
 from calstudy.power.spectra import DelaySpectra
@@ -236,8 +236,7 @@ def _exponential(sample: np.ndarray) -> float:
 
 def thinned(power: np.ndarray, modes: DelaySpectra) -> np.ndarray:
     """Return the powers of modes (Nu, Nd) of which no two are correlated, flattened."""
-    correlation = mode_correlation(modes.taper, modes.delay.size)
-    step = int(np.argmax(correlation < UNCORRELATED))
+    step = int(np.argmax(modes.between_delays < UNCORRELATED))
     # See `calstudy.power.binned`: powers of two baselines correlate by the square of the beam's own transform.
     rate = 2 * np.pi * modes.omega_pp * (modes.frequency / SPEED_OF_LIGHT) ** 2
     reach = np.sqrt(-np.log(UNCORRELATED) / rate)
