@@ -290,6 +290,8 @@ def estimate_power(even: UVData, odd: UVData, beam: PowerBeam, settings: PowerSe
 
 def _usable(pairs: list[Pair], even: UVData, odd: UVData, taper: str) -> list[Pair]:
     """Leave out pairs that have no data in some polarization, or too few channels in common (`MOST_NOISE`)."""
+    if not (even.flag_array.any() or odd.flag_array.any()):
+        return pairs
     numbers = antenna_pairs(even).tolist()
     rows = {pair: row for row, (a, b) in enumerate(numbers) for pair in ((a, b), (b, a))}
     first, second = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
