@@ -19,7 +19,7 @@ def identity(value: Any) -> Any:
     Fields of sections are omitted if they have their default, so that a new field does not change the keys of earlier
     products; a change of a default requires a new version of the stages that read it, or of the field
     (`calstudy.base.schema.REVISED`). Files, and folders of them, are identified by their content (`identity_of_file`),
-    and a plug-in by its file or the version of its package.
+    those that are named by default too, and a plug-in by its file or the version of its package.
     """
     if isinstance(value, BaseModel):
         return _identity_of_section(value)
@@ -46,7 +46,7 @@ def _identity_of_section(section: BaseModel) -> dict[str, Any]:
             found[name] = section.registry.identity(value)
         elif isinstance(extra, dict) and extra.get("keyed") is False:
             continue
-        elif value != default:
+        elif value != default or (isinstance(value, Path) and value.exists()):
             content = identity(value)
             # A block with the identity of the default is left out as well.
             if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):

@@ -74,8 +74,13 @@ def beside_of(path: Path) -> dict[str, Path]:
         for candidate in (place.with_suffix(".py"), place / "__init__.py"):
             if candidate.is_file() and candidate != path and name not in found:
                 found[name] = candidate
-                waiting += _imported(candidate)
+                waiting += _imported(candidate, _package(name, candidate))
     return found
+
+
+def _package(name: str, file: Path) -> str:
+    """Return the name of the package in which a module imports relative names."""
+    return name if file.name == "__init__.py" else name.rpartition(".")[0]
 
 
 def identity_of_file(path: Path, part: str = "") -> str:
@@ -88,8 +93,8 @@ def identity_of_file(path: Path, part: str = "") -> str:
     return f"sha256:{digest_file(path)}{part}{others}"
 
 
-def _imported(path: Path, in_functions: bool = False) -> Iterator[str]:
-    """Yield the names of all modules that a file may import, and of the packages that they are in.
+def _imported(path: Path, package: str = "", in_functions: bool = False) -> Iterator[str]:
+    """Yield the names of all modules that a file of a package may import, and of the packages that they are in.
 
     With `in_functions`, of those alone that its functions import.
     """
@@ -101,11 +106,14 @@ def _imported(path: Path, in_functions: bool = False) -> Iterator[str]:
     for node in (node for root in (functions if in_functions else [tree]) for node in ast.walk(root)):
         if isinstance(node, ast.Import):
             names = [item.name for item in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module, *(f"{node.module}.{item.name}" for item in node.names)]
+        elif isinstance(node, ast.ImportFrom):
+            # Each dot but the first leads one package up.
+            inside = package.split(".")[: package.count(".") + 2 - node.level] if node.level else []
+            source = [part for part in (*inside, node.module) if part]
+            names = [".".join([*source, *item]) for item in ([], *([alias.name] for alias in node.names))]
         else:
             continue
-        for name in names:
+        for name in filter(None, names):
             parts = name.split(".")
             yield from (".".join(parts[: count + 1]) for count in range(len(parts)))
 
@@ -141,7 +149,8 @@ def _modules_beside(path: Path, beside: dict[str, Path]) -> Iterator[None]:
     Raises InputError if a function imports such a module, since a call would import that of the other file.
     """
     own = {name: found for name, found in beside.items() if not _is_installed(name.partition(".")[0])}
-    late = {name for file in (path, *own.values()) for name in _imported(file, in_functions=True)}
+    packages = {path: "", **{file: _package(name, file) for name, file in own.items()}}
+    late = {name for file, package in packages.items() for name in _imported(file, package, in_functions=True)}
     # They may import any of the others, and as late.
     later = set() if late.isdisjoint(own) else set(own)
     for name in own:

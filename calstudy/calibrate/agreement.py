@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 TAPER = "blackman-harris"
 MAIN_LOBE = 4
 """Half-width of the taper's main lobe, in units of 1 / bandwidth."""
+ROUNDING = 1e-24
+"""Powers below this part of the largest are rounding."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,9 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
         for values in (truth.gains, aligned - truth.gains, fit.gains - truth.gains)
     ]
-    by_delay, raw_by_delay = (np.sqrt(part / power[0]) for part in power[1:])
+    # That of gains of unity has zeros.
+    known = power[0] > ROUNDING * power[0].max()
+    by_delay, raw_by_delay = (np.sqrt(part[known] / power[0][known]) for part in power[1:])
     return {
         "gains_aligned": Statistic.of(gain_errors(aligned, truth.gains), "antennas and integrations"),
         "gains_raw": Statistic.of(gain_errors(fit.gains, truth.gains), "antennas and integrations"),

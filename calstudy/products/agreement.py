@@ -62,7 +62,7 @@ class AgreementTable(StudyTable):
         return [agreement(graph)]
 
 
-class Agreement(Task, stage="agreement", version=3):
+class Agreement(Task, stage="agreement", version=4):
     """A calibration against the truth, at some or all integrations."""
 
     buffer: float

@@ -167,6 +167,17 @@ def test_noise_taken_up_inside_the_wedge_is_seen_there_only(truth):
     assert found["data_over_noise_outside"] > 50
 
 
+@pytest.mark.parametrize("channels", [16, 24, 64])
+def test_delays_without_power_of_the_true_gains_are_left_out(truth, channels):
+    """The transform of gains of unity has a zero, or rounding in its place, at the largest delay."""
+    unity = np.ones_like(truth.gains[..., :channels])
+    kept = Truth(unity, *(values[..., :channels] for values in (truth.foregrounds, truth.noise, truth.data)))
+    wrong = 1.01 * unity
+    baselines = Baselines(PAIRS, LENGTHS, FREQUENCY[:channels], 100e-9)
+    found = compare_with_truth(kept, Fit(wrong, kept.foregrounds, kept.noise), baselines)
+    assert found["gains_raw_worst_delay"].value == pytest.approx(0.01, rel=1e-6)
+
+
 def test_measurements_keep_through_json(truth):
     found = compare_with_truth(truth, fit(truth), BASELINES)
     assert from_json(as_json(found)) == found

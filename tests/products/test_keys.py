@@ -6,7 +6,7 @@ import pytest
 from tiny import tiny
 
 from calstudy.base.identity import identity
-from calstudy.base.user_code import load_function
+from calstudy.base.user_code import load_file, load_function
 from calstudy.corrupt.interface import Effect
 from calstudy.experiment.files import override, validate
 from calstudy.products import calibration, corruption, signal_loss, simulation, spectra
@@ -243,6 +243,61 @@ def test_a_plug_in_counts_with_the_modules_that_it_imports_from_its_folder(tmp_p
     (tmp_path / "parts.py").write_text("half = 0.25\n")
     assert identity(effect()) != before
     assert effect().apply(1.0, None, {}) == 0.25
+
+
+@pytest.mark.parametrize("line", ["from .amount import half", "from . import amount\n\nhalf = amount.half"])
+def test_a_plug_in_counts_with_the_modules_that_a_package_of_its_folder_imports(tmp_path, line):
+    (tmp_path / "sizes").mkdir()
+    (tmp_path / "sizes" / "__init__.py").write_text("from .inner import share\n")
+    (tmp_path / "sizes" / "inner").mkdir()
+    (tmp_path / "sizes" / "inner" / "__init__.py").write_text(f"from ..amount import half as _\n{line}\nshare = half\n")
+    for place in ("amount.py", "inner/amount.py"):
+        (tmp_path / "sizes" / place).write_text("half = 0.5\n")
+    (tmp_path / "quieter.py").write_text(
+        "from sizes import share\nfrom calstudy.corrupt.interface import Effect\n\n\nclass Quieter(Effect):\n"
+        "    def apply(self, visibilities, observation, truth):\n        return share * visibilities\n"
+    )
+
+    def effect() -> Effect:
+        return validate(override(tiny(tmp_path), "corruption.effects", ["quieter.py"]), tmp_path).corruption.effects[0]
+
+    before = identity(effect())
+    assert effect().apply(1.0, None, {}) == 0.5
+    (tmp_path / "sizes" / "inner" / "amount.py").write_text("half = 0.25\n")
+    between = identity(effect())
+    assert effect().apply(1.0, None, {}) == 0.25
+    (tmp_path / "sizes" / "amount.py").write_text("half = 0.25\n")
+    assert len({str(found) for found in (before, between, identity(effect()))}) == 3
+
+
+def test_a_file_that_a_plug_in_names_by_default_counts_by_its_content(tmp_path):
+    (tmp_path / "table.txt").write_text("0.5")
+    (tmp_path / "quieter.py").write_text(
+        "from pathlib import Path\nfrom pydantic import Field\nfrom calstudy.corrupt.interface import Effect\n\n\n"
+        f"class Quieter(Effect):\n    table: Path = Field(Path({str(tmp_path / 'table.txt')!r}), strict=False)\n\n"
+        "    def apply(self, visibilities, observation, truth):\n        return visibilities\n"
+    )
+
+    def key() -> object:
+        settings = validate(override(tiny(tmp_path), "corruption.effects", ["quieter.py"]), tmp_path)
+        return identity(settings.corruption.effects[0])
+
+    before = key()
+    (tmp_path / "table.txt").write_text("0.25")
+    assert key() != before
+
+
+def test_a_product_of_a_file_counts_with_the_content_of_the_file(tmp_path):
+    code = (
+        "from calstudy.run.task import Task\n\n\nclass Answer(Task, stage='answer'):\n"
+        "    def make(self, output):\n        return {'answer': 42}\n"
+    )
+    keys = []
+    for name, text in (("first", code), ("second", code.replace("42", "43")), ("third", code)):
+        (tmp_path / f"{name}.py").write_text(text)
+        keys.append(load_file(tmp_path / f"{name}.py").Answer("").key)
+    assert keys[0] != keys[1]
+    assert keys[0] == keys[2]
 
 
 def test_sources_from_code_count_with_the_modules_that_it_imports_from_its_folder(tmp_path):
