@@ -296,8 +296,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a key without the version",
-        "own = [*self.stage, self.content, inputs]",
-        "own = [self.stage.name, self.content, inputs]",
+        "own = [*self.stage, self.content, inputs, *code]",
+        "own = [self.stage.name, self.content, inputs, *code]",
         KEYS,
     ),
     Mutation(
@@ -314,7 +314,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a field that is in no key",
-        "elif value != default:\n            content",
+        "elif value != default or (isinstance(value, Path) and value.exists()):\n            content",
         'elif value != default and name != "tolerance":\n            content',
         KEYS,
     ),
