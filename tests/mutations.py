@@ -295,6 +295,12 @@ MUTATIONS = (
         FITS,
     ),
     Mutation(
+        "flags that correlate no delays",
+        "return found if found.size else mode_correlation(self.taper, self.delay.size)",
+        "return mode_correlation(self.taper, self.delay.size)",
+        AVERAGES,
+    ),
+    Mutation(
         "a key without the version",
         "own = [*self.stage, self.content, inputs, *code]",
         "own = [self.stage.name, self.content, inputs, *code]",
