@@ -69,7 +69,7 @@ class Section(BaseModel):
         except OSError as error:
             raise unusable(f"cannot be read ({error.strerror}; looked for {path})") from None
         if not found:
-            raise unusable(f"{path} is no {wanted}" if path.exists() else f"no such {wanted} (looked for {path})")
+            raise unusable(f"{path} is not a {wanted}" if path.exists() else f"no such {wanted} (looked for {path})")
         return path.resolve()
 
     def with_defaults(self, *names: str) -> Self:

@@ -110,7 +110,7 @@ def _imported(path: Path, package: str = "", in_functions: bool = False) -> Iter
             # Each dot but the first leads one package up.
             inside = package.split(".")[: package.count(".") + 2 - node.level] if node.level else []
             source = [part for part in (*inside, node.module) if part]
-            names = [".".join([*source, *item]) for item in ([], *([alias.name] for alias in node.names))]
+            names = [".".join(source), *(".".join([*source, item.name]) for item in node.names)]
         else:
             continue
         for name in filter(None, names):

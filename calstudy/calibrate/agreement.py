@@ -148,7 +148,7 @@ def _gains(truth: Truth, fit: Fit, baselines: Baselines) -> dict[str, Statistic]
         np.mean(np.abs(delay_transform(values, baselines.frequency, TAPER)) ** 2, axis=(0, 1))
         for values in (truth.gains, aligned - truth.gains, fit.gains - truth.gains)
     ]
-    # That of gains of unity has zeros.
+    # The power of unit gains is zero at some delays.
     known = power[0] > ROUNDING * power[0].max()
     by_delay, raw_by_delay = (np.sqrt(part[known] / power[0][known]) for part in power[1:])
     return {

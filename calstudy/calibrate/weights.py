@@ -249,7 +249,7 @@ def _weightless(data: Observation, crosses: np.ndarray, live: np.ndarray, settin
         return []
     whole = f", all of antenna(s) {_named(data, lost)} among them" if lost.any() else ""
     return [
-        f"{100 * fraction:.2g} % of the unflagged samples have no weight by weights: {settings.kind}, and count as "
+        f"{100 * fraction:.3g} % of the unflagged samples have no weight by weights: {settings.kind}, and count as "
         f"flagged{whole}: {WEIGHTLESS[settings.kind]}, or use weights: gains or flags."
     ]
 

@@ -16,7 +16,7 @@ from calstudy.base.visibilities import polarization_names
 from calstudy.power.binned import independent_times, make_bin_edges
 from calstudy.power.delay import TAPERS, channel_width, delays, horizon_delay
 from calstudy.power.settings import ESTIMATORS, PowerSettings
-from calstudy.power.spectra import DelaySpectra, average_times, bins_of_k, modes_of, outside_wedge
+from calstudy.power.spectra import DelaySpectra, average_times, bins_of_k, modes_of, of_common_units, outside_wedge
 
 if TYPE_CHECKING:
     from pyuvdata import UVData
@@ -136,6 +136,8 @@ def estimate_spectra(
         found.append(spectra)
     if len(found) == 1:
         return found[0]
+    # Pairs of baselines with few channels in common are left out of one block, and not of another.
+    found = list(of_common_units({f"block {number}": one for number, one in enumerate(found, 1)}).values())
     sidereal_times = np.array([first.lst_array[0] for first, _ in blocks])
     latitude = float(even.telescope.location.lat.rad)
     return average_times(found, independent_times(sidereal_times, latitude, found[0].omega_pp))

@@ -110,17 +110,17 @@ class DelaySpectra:
         return members
 
     def of_units(self, units: np.ndarray) -> DelaySpectra:
-        """Return the spectra of some units, by their numbers, in this order."""
-        place = np.full(self.n_pairs.size, -1)
-        place[units] = np.arange(units.size)
-        shares = place[self.share_unit] >= 0
+        """Return the spectra of some units, by their numbers, in this order; a number may come several times."""
+        order = np.argsort(self.share_unit, kind="stable")
+        first, last = (np.searchsorted(self.share_unit[order], units, side=side) for side in ("left", "right"))
+        shares = np.concatenate([order[:0], *(order[start:end] for start, end in zip(first, last, strict=True))])
         return replace(
             self,
             power=self.power[units],
             vectors=self.vectors[units],
             n_pairs=self.n_pairs[units],
             k_perp=self.k_perp[units],
-            share_unit=place[self.share_unit[shares]],
+            share_unit=np.repeat(np.arange(units.size), last - first),
             share_antenna=self.share_antenna[shares],
             share_pairs=self.share_pairs[shares],
             share_power=self.share_power[shares],
@@ -338,9 +338,12 @@ def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpect
 
     Baselines that are completely flagged have no spectra. Those of an antenna without gains are missing in the spectra
     of the residual, but not in those of the EoR. A redundant group that lacks some of its baselines in one of the
-    spectra is the same sample of the sky, and counts as many pairs in all. The spectra, by name, have the same delays
-    and their units in the same order. A warning says if they are averages of different times or polarizations. Raise
-    InputError if they have no unit in common or units that cannot be told apart.
+    spectra is the same sample of the sky, and counts as many pairs in all; parts of a group, which flags split, count
+    each. Groups of the spectra with the fewest pairs are left out where another lacks one of their baselines.
+
+    The spectra, by name, have the same delays and their units in the same order. A warning says if they are averages
+    of different times or polarizations. Raise InputError if they have no unit in common or units that cannot be told
+    apart.
     """
     averaged = {name: (one.n_times, one.n_polarizations) for name, one in spectra.items()}
     if len(set(averaged.values())) > 1:
@@ -364,7 +367,7 @@ def of_common_units(spectra: Mapping[str, DelaySpectra]) -> dict[str, DelaySpect
     common = np.logical_and.reduce([found >= 0 for found in matches.values()])
     if not common.any():
         raise InputError("no baseline has data in all of " + ", ".join(spectra))
-    left_out = max(map(len, keys)) - int(common.sum())
+    left_out = max(len(key) - np.unique(matches[name][common]).size for name, key in zip(matches, keys, strict=True))
     if left_out:
         logger.warning("%d of %d baselines or redundant groups are left out: flagged", left_out, max(map(len, keys)))
     kept = fewest.of_units(np.flatnonzero(common))

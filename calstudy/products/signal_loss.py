@@ -39,7 +39,6 @@ from calstudy.products.calibration import in_words
 from calstudy.products.corruption import PARITIES
 from calstudy.products.files import (
     AVERAGE,
-    GAINS,
     RESIDUAL,
     SCORE,
     TRANSFER,
@@ -135,7 +134,7 @@ def difference(label: str, averages: Sequence[Task], source: str) -> Task:
     )
 
 
-class Difference(InBlocks, stage="difference", version=3):
+class Difference(InBlocks, stage="difference", version=4):
     """The response of a residual to the signal, averaged."""
 
     with_signal: Input
@@ -145,23 +144,21 @@ class Difference(InBlocks, stage="difference", version=3):
     def make(self, output: Path) -> Mapping[str, Any]:
         """Write the response to average.uvh5.
 
-        Where other samples have gains with the signal than without it, both have the flags of either before they are
+        Where other samples are flagged with the signal than without it, both have the flags of either before they are
         averaged: foregrounds and noise would not cancel in a difference of averages.
         """
         from calstudy.power.average import average_in_blocks
 
         averages = [read_visibilities(folder / AVERAGE) for folder in (self.with_signal, self.without_signal)]
         response, warnings = signal_response(*averages), []
-        flags, others = (_flags_of(folder / GAINS) for folder in self.calibrations.values())
+        flags, others = (_flags_of(folder / RESIDUAL) for folder in self.calibrations.values())
         if not np.array_equal(flags, others):
             found = signal_response(*(read_visibilities(folder / RESIDUAL) for folder in self.calibrations.values()))
             found = crosses_of(found)
             found.data_array[found.flag_array] = 0
             response = average_in_blocks(found, self.blocks_of(found))
-            part = 1 - np.mean(response.nsample_array) / max(np.mean(average.nsample_array) for average in averages)
-            warnings = [
-                f"{part:.2%} of the samples are left out of T: they have gains only with the EoR, or only without"
-            ]
+            part = np.mean(flags ^ others) / np.mean(~(flags & others))
+            warnings = [f"{part:.2%} of the samples are left out of T: flagged only with the EoR, or only without"]
         write_visibilities(response, output / AVERAGE)
         return {"warnings": warnings}
 
@@ -171,7 +168,7 @@ class Difference(InBlocks, stage="difference", version=3):
 
 
 def _flags_of(path: Path) -> np.ndarray:
-    """Read the flags of gains alone, which takes less time than a `UVCal`."""
+    """Read the flags of visibilities alone, which takes less time than a `UVData`."""
     import h5py
 
     with h5py.File(path) as file:

@@ -612,6 +612,22 @@ def test_redundant_groups_that_lack_an_antenna_keep_the_signal(observe, white, b
         np.testing.assert_allclose(error, 0, atol=1e-7)
 
 
+def test_parts_of_a_group_that_flags_split_are_matched_with_the_whole(observe, white, beam):
+    """Pairs of baselines with no channels in common are left out; those that are left are two units of one group."""
+    settings = PowerSettings(pairs="redundant-group", wedge_buffer="0 ns")
+    uvd = white(observe(HexLayout(kind="hex", side=3), n_channels=64), np.random.default_rng(5))
+    eor = delay_spectra(estimate_power(uvd, uvd, beam, settings), settings)
+    part = uvd.copy()
+    part.flag_array[(antenna_pairs(part) <= 6).any(axis=1), 30:] = True
+    part.flag_array[(antenna_pairs(part) >= 12).any(axis=1), :34] = True
+    residual = delay_spectra(estimate_power(part, part, beam, settings), settings)
+    assert len(residual.n_pairs) > len(eor.n_pairs)
+    common = of_common_units({"eor": eor, "residual": residual})
+    for name in ("n_pairs", "share_unit", "share_antenna", "share_pairs"):
+        np.testing.assert_array_equal(getattr(common["eor"], name), getattr(common["residual"], name))
+    assert len(common["eor"].n_pairs) > len(eor.n_pairs)
+
+
 def test_tables_come_back(tmp_path):
     rng = np.random.default_rng(2)
     spectra = make_spectra(rng.normal(size=(6, 16)) + 0j, rng.normal(size=(6, 3)) * 20)

@@ -12,8 +12,8 @@ from astropy.time import Time
 
 from calstudy.base.constants import SIDEREAL_DAY
 from calstudy.base.errors import InputError
-from calstudy.base.visibilities import baseline_vectors, from_cube, to_cube
-from calstudy.instrument.array_layouts.geometric import GolombLayout
+from calstudy.base.visibilities import antenna_pairs, baseline_vectors, from_cube, to_cube
+from calstudy.instrument.array_layouts.geometric import GolombLayout, HexLayout
 from calstudy.power.average import average_in_blocks, divide, fringe_stop_and_average
 from calstudy.power.binned import independent_times, modes_in_bins, noise_level, sample_modes, spherical_average
 from calstudy.power.interface import estimate_spectra
@@ -136,6 +136,20 @@ def test_flagged_blocks_and_baselines_are_left_out(observe, white, beam, rng):
     assert len(found.vectors) == n - 1
     with pytest.raises(InputError, match=r"power\.coherent_time: even and odd data have 4 and 3 blocks"):
         estimate_spectra(even, odd.select(blt_inds=np.arange(3 * n), inplace=False), beam, SETTINGS)
+
+
+@pytest.mark.parametrize("pairs", ["same-baseline", "redundant-group"])
+def test_pairs_that_a_block_lacks_are_left_out_of_all(pairs, observe, white, beam, rng):
+    settings = PowerSettings(pairs=pairs)
+    template = observe(HexLayout(kind="hex", side=2), n_channels=64, n_times=2, integration=600.0)
+    even, odd = white(template, rng), white(template, rng)
+    whole = estimate_spectra(even, odd, beam, settings)
+    for antenna in (0, 6):
+        rows = even.Nbls + np.flatnonzero((antenna_pairs(even) == antenna).any(axis=1))
+        even.flag_array[rows, 26:] = odd.flag_array[rows, :26] = True
+    part = estimate_spectra(even, odd, beam, settings)
+    assert part.n_times == 2
+    assert part.n_pairs.sum() < whole.n_pairs.sum()
 
 
 def test_blocks_without_one_of_the_polarizations_are_left_out(observe, white, beam, rng):
