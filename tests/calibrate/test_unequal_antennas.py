@@ -70,7 +70,7 @@ def test_an_antenna_that_is_lost_by_its_flagged_autocorrelations_is_named():
     by_autos, by_flags = ({"calibrator": "calamity", "weights": kind} for kind in ("autos", "flags"))
     # Five of the fifteen baselines.
     assert conspicuous(Observation(uvd), CALIBRATORS.make(by_autos)) == [
-        "33 % of the unflagged samples have no weight by weights: autos, and count as flagged, all of antenna(s) "
+        "33.3 % of the unflagged samples have no weight by weights: autos, and count as flagged, all of antenna(s) "
         f"{LOUD} among them: autocorrelations are flagged or not positive; repair or unflag them, or use weights: "
         "gains or flags."
     ]
