@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, wraps
 from html import escape
 from io import StringIO
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, cast, get_origin, get_type_hints
@@ -387,8 +387,10 @@ class OpenRun:
 
         missing = "the run is no comparison, and has no standings; `scores` has its T and bias"
         self._folder.tables.path(COMPARISON, missing)
-        if not limit > 0:
+        if not (isinstance(limit, Real) and limit > 0):
             raise InputError(f"limit = {limit!r}: must be greater than 0, in units of the power of the EoR")
+        if isinstance(worlds, str):
+            raise InputError(f"worlds = {worlds!r}: must be a list of names, such as [{worlds!r}]")
         found = self._folder.standings(limit, worlds)
         columns = ["k_from", "k_to", "calibrator", "standing", "worlds", "bias_below", "transfer"]
         worlds_of = [[world.world for world in entry.decisive] for entry in found]
@@ -516,7 +518,8 @@ class OpenRun:
 
     def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
         if not (names := self._folder.tables.variants):
-            remedy = "take one of its parts" if self.parts else "run the experiment again"
+            has_tables = "its numbers are in its tables" if self.tables else "run the experiment again"
+            remedy = "take one of its parts" if self.parts else has_tables
             raise InputError(f"{self.name}: has no spectra by variant; {remedy}")
         return ByVariant(names, read)
 

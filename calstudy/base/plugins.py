@@ -240,6 +240,11 @@ class Registry(Kinds[P]):
         reference = str(path) if file["name"] is None else f"{path}:{file['name']}"
         return self.find(reference), reference
 
+    def make(self, block: Any, default: str | None = None, **context: Any) -> P:
+        """Return the plug-in that a name, a path or a block describes; errors of its own validation name its line."""
+        with user_code():
+            return super().make(block, default, **context)
+
     def others(self) -> list[JsonSchemaValue]:
         """Return the JSON schemas of references to files, and of blocks of plug-ins that are not built in."""
         file: JsonSchemaValue = {"type": "string", "pattern": r"\.py(:\w+)?$"}
@@ -270,3 +275,12 @@ def guarded(thing: Plugin) -> AbstractContextManager[None]:
     Errors of built-in plug-ins pass unchanged.
     """
     return nullcontext() if thing.is_built_in else user_code(thing.label)
+
+
+def refusal_of(thing: Any, *given: Any) -> str | None:
+    """Return why a plug-in refuses what it is given, in its own words, or None; raises InputError for anything else."""
+    with guarded(thing):
+        reason = thing.refusal(*given)
+    if reason is None or isinstance(reason, str):
+        return reason
+    raise InputError(f"{thing.label}: refusal returned {reason!r}; return a sentence that says why, or None")

@@ -34,19 +34,38 @@ FOLDER: JsonDict = {"folder": True}
 """`json_schema_extra` of a path that is a folder of input files."""
 NESTED = "nested"
 """Type of the validation error that contains the faults of a block's own settings."""
+NOT_IN_FILES = ("tuple", "set", "frozenset", "lax-or-strict")
+"""Types of pydantic's schemas for values that a file holds as lists or texts; the last one is that of paths."""
+
+
+def _of_files(schema: Any) -> Any:
+    """Return pydantic's schema of a section, in which types that a file cannot hold also take lists and texts."""
+    if isinstance(schema, list):
+        return [_of_files(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    relaxed = {"strict": False} if schema.get("type") in NOT_IN_FILES else {}
+    kept = ("default", "metadata", "serialization")
+    return relaxed | {name: part if name in kept else _of_files(part) for name, part in schema.items()}
 
 
 class Section(BaseModel):
     """A validated, immutable, keyword-only block of an experiment file.
 
-    Unknown keys are errors, values are never coerced between kinds (``"3"`` is not ``3``), and every physical
-    quantity carries its unit in the file and is a plain SI float once validated (see `calstudy.base.units`).
+    Unknown keys are errors, values are never coerced between kinds (``"3"`` is not ``3``), except that a list of the
+    file becomes a tuple or set, and a text a path, where the field has this type. Every physical quantity carries its
+    unit in the file and is a plain SI float once validated (see `calstudy.base.units`).
     Paths are those of input files, which must exist, unless `holds_input_files` is false.
     """
 
     holds_input_files: ClassVar[bool] = True
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Accept what a file can hold for fields of a type that it cannot."""
+        return _of_files(handler(source))
 
     @field_validator("*")
     @classmethod

@@ -249,12 +249,12 @@ class UserCodeError(InputError):
 
 
 @contextmanager
-def user_code(name: str) -> Iterator[None]:
+def user_code(name: str = "") -> Iterator[None]:
     """Run a user's code; its errors, SystemExit included, become a `UserCodeError` that names the line, or else `name`.
 
     `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
-    defects of calstudy, except where the call itself does not fit the user's function. KeyboardInterrupt passes in the
-    main thread, where it is Ctrl-C.
+    defects of calstudy, except where the call itself, of `name`, does not fit the user's function. KeyboardInterrupt
+    passes in the main thread, where it is Ctrl-C.
     """
     try:
         yield
@@ -264,7 +264,7 @@ def user_code(name: str) -> Iterator[None]:
         if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
             raise
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
-        if not frames and not isinstance(error, TypeError | SystemExit | ImportError):
+        if not frames and not (name and isinstance(error, TypeError | SystemExit | ImportError)):
             raise
         if frames:
             last = frames[-1]

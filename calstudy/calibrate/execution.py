@@ -18,7 +18,7 @@ from numpy.polynomial.legendre import legvander
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.observation import Frame, Observation
-from calstudy.base.plugins import FILE_REFERENCE, guarded
+from calstudy.base.plugins import FILE_REFERENCE, guarded, refusal_of
 from calstudy.base.quiet import without_warnings
 from calstudy.base.resources import Cost, Usage
 from calstudy.base.visibilities import positions
@@ -184,9 +184,7 @@ def _smooth_cal(values: np.ndarray, used: np.ndarray, data: Observation, setting
 
 def require_calibratable(calibrator: Calibrator, frame: Frame, has_sky_model: bool) -> None:
     """Raise InputError, with the calibrator's own sentence, if it refuses data of these baselines and channels."""
-    with guarded(calibrator):
-        reason = calibrator.refusal(frame, has_sky_model)
-    if reason is not None:
+    if (reason := refusal_of(calibrator, frame, has_sky_model)) is not None:
         about_field = calibrator.is_about_field(reason)
         raise InputError(f"calibration.{reason}" if about_field else f"{_where(calibrator)}: {reason}")
 

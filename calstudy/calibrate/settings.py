@@ -156,7 +156,7 @@ class FileWeights(Section):
     """Weights from a UVFlag file in metric mode, by baseline, with the samples of the data; zero is a flag."""
 
     kind: Literal["file"]
-    path: Path = Field(strict=False)
+    path: Path
 
 
 Weights = Annotated[GainWeights | FlagWeights | SampleWeights | AutoWeights | FileWeights, choice("kind", "gains")]
@@ -209,7 +209,7 @@ class FileStart(Section):
     """Start from gains in a file, at the integration closest in time."""
 
     kind: Literal["file"]
-    path: Path = Field(strict=False)
+    path: Path
 
 
 class RedundantStart(Section):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from calstudy.base.errors import InputError, errors_of_files
-from calstudy.base.plugins import guarded
+from calstudy.base.plugins import guarded, refusal_of
 from calstudy.base.resources import Cost
 from calstudy.base.user_code import without_code_of_files
 from calstudy.calibrate.settings import GainFit
@@ -187,11 +187,7 @@ def members_by_role(
 
 def refusal_of_role(papers: Sequence[Paper], role: str, experiment: Experiment) -> str | None:
     """Return why an experiment cannot play a role in any of the papers that have it, or None if it can in one."""
-    found: list[str | None] = []
-    for paper in papers:
-        if role in paper.roles:
-            with guarded(paper):
-                found.append(paper.refusal(role, experiment))
+    found = [refusal_of(paper, role, experiment) for paper in papers if role in paper.roles]
     return None if None in found else next(iter(found), None)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from calstudy.base.errors import InputError
-from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.plugins import Plugin, Registry, guarded, refusal_of
 from calstudy.base.resources import Cost
 from calstudy.base.schema import fault
 from calstudy.corrupt.drift import Drift, refusal_of_antennas
@@ -155,9 +155,7 @@ class GainEffect(Effect):
 def require_usable(effects: Sequence[Effect], size: Size) -> None:
     """Raise InputError, with the effect's own sentence, if one of `corruption.effects` refuses data of a size."""
     for place, effect in enumerate(effects):
-        with guarded(effect):
-            reason = effect.refusal(size)
-        if reason is not None:
+        if (reason := refusal_of(effect, size)) is not None:
             named = "." if effect.is_about_field(reason) else f" = {effect.label!r}: "
             raise InputError(f"corruption.effects.{place}{named}{reason}")
 

@@ -64,7 +64,7 @@ def _different(seeds: tuple[int, int]) -> tuple[int, int]:
 Seed = Annotated[int, Field(ge=0)]
 Seeds = Annotated[
     tuple[Seed, Seed],
-    Field(strict=False, description="Seeds of the even and odd realization."),
+    Field(description="Seeds of the even and odd realization."),
     AfterValidator(_different),
 ]
 

@@ -30,7 +30,6 @@ class CorruptionSettings(Section):
     effects: Annotated[
         tuple[Annotated[SerializeAsAny[Effect], EFFECTS.field()], ...],
         Field(
-            strict=False,
             description="What happens to the sum of foregrounds, EoR and noise, in this order; an empty list: nothing.",
         ),
     ] = (EFFECTS.make("per-channel-gains"),)

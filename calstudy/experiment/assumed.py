@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
 from calstudy.base.errors import ExperimentError
@@ -34,7 +34,7 @@ class AssumedWorld(Section):
 class AssumedFile(Section):
     """The file of visibilities that the calibrator assumes."""
 
-    sky_model: Path = Field(strict=False)
+    sky_model: Path
 
 
 def assumed_changes(assumed: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, mod
 
 from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
-from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.plugins import Plugin, Registry, refusal_of
 from calstudy.base.schema import Section, fault
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
@@ -37,19 +37,19 @@ TABLE_NAME = re.compile(r"(?!(as-built|sky-model)$)[A-Za-z0-9][A-Za-z0-9_-]*")
 VARIANT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
-Figures = Annotated[tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...], Field(strict=False)]
-StudyTables = Annotated[tuple[Annotated[SerializeAsAny[Plugin], TABLES.field()], ...], Field(strict=False)]
+Figures = tuple[Annotated[SerializeAsAny[Plugin], FIGURES.field()], ...]
+StudyTables = tuple[Annotated[SerializeAsAny[Plugin], TABLES.field()], ...]
 Scales = Annotated[
     dict[str, dict[str, Any]],
     Field(description="Named sets of overrides (dotted path: value), chosen with --scale."),
 ]
-Papers = Annotated[tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...], Field(strict=False)]
+Papers = tuple[Annotated[SerializeAsAny[Plugin], PAPERS.field()], ...]
 
 
 class Variant(Section):
     """One version of the data that is carried to a power spectrum."""
 
-    components: Annotated[tuple[Component, ...], Field(strict=False, min_length=1)] = Field(
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = Field(
         description="What is added up before any effect."
     )
     effects: bool = Field(False, description="Let the effects of `corruption.effects` happen to the data.")
@@ -74,7 +74,7 @@ def _paper_variants() -> dict[str, Variant]:
     }
 
 
-Pair = Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], Field(strict=False)]
+Pair = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
 
 class Inspection(Section):
@@ -83,7 +83,7 @@ class Inspection(Section):
     antennas: Pair = Field((0, 1), description="Two antennas; the model and data figures show their baseline.")
     integration: int = Field(0, ge=0, description="Counted from 0.")
     realization: Literal["even", "odd"] = "even"
-    baselines: Annotated[tuple[Pair, ...], Field(strict=False, min_length=1)] | None = Field(
+    baselines: Annotated[tuple[Pair, ...], Field(min_length=1)] | None = Field(
         None, description="Baselines of the `baselines` figure, such as [[0, 1], [0, 5]]; null: four, short to long."
     )
 
@@ -113,7 +113,7 @@ class Convergence(Section):
     solvers: Annotated[dict[str, Solver], Field(min_length=1, max_length=5)] = Field(
         default_factory=_followed_solvers, description="By the names that they have in the figure."
     )
-    steps: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(strict=False, min_length=1)] = Field(
+    steps: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = Field(
         (1, 2, 3, 4, 6, 8, 10, 20, 50, 100, 200, 500, 1000, 2000, 4000, 8000, 16_000),
         description="After how many steps they are looked at, besides their end.",
     )
@@ -124,8 +124,8 @@ class Folders(Section):
 
     holds_input_files: ClassVar[bool] = False
 
-    store: Path = Field(Path("store"), strict=False, description="Folder of products, shared by all studies.")
-    runs: Path = Field(Path("runs"), strict=False, description="Folder in which each run gets its own folder.")
+    store: Path = Field(Path("store"), description="Folder of products, shared by all studies.")
+    runs: Path = Field(Path("runs"), description="Folder in which each run gets its own folder.")
 
     @model_validator(mode="after")
     def _folders_differ(self) -> Self:
@@ -146,7 +146,7 @@ class Outputs(Folders):
     convergence: Convergence = Convergence()
 
 
-SweepValues = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
+SweepValues = Annotated[tuple[Any, ...], Field(min_length=1)]
 SweepBlock = Annotated[dict[str, SweepValues], Field(min_length=1)]
 
 
@@ -157,7 +157,7 @@ def _as_list(blocks: Any) -> Any:
 class RealizationBlock(Section):
     """Realizations of an experiment, which differ in the seeds of random parts; the first is the experiment itself."""
 
-    draw: Annotated[tuple[Literal["eor", "gains", "noise"], ...], Field(strict=False)] = Field(
+    draw: tuple[Literal["eor", "gains", "noise"], ...] = Field(
         ("eor", "gains", "noise"), description="What is drawn again in every realization; the rest is common to all."
     )
     count: int = Field(10, ge=2, le=1000, description="Number of realizations, with the experiment itself.")
@@ -204,7 +204,6 @@ class Experiment(Section):
     )
     sweep: Annotated[
         tuple[SweepBlock, ...],
-        Field(strict=False),
         BeforeValidator(_as_list, json_schema_input_type=SweepBlock | tuple[SweepBlock, ...]),
     ] = Field(
         (),
@@ -213,7 +212,6 @@ class Experiment(Section):
     )
     realizations: Annotated[
         tuple[RealizationBlock, ...],
-        Field(strict=False),
         BeforeValidator(_as_list, json_schema_input_type=RealizationBlock | tuple[RealizationBlock, ...]),
     ] = Field(
         (),
@@ -292,8 +290,7 @@ class Experiment(Section):
                 yield path, f"{thing.label!r} cannot name a {what}, or does so already: use another file name"
             labels.append(thing.label)
             try:
-                with guarded(thing):
-                    refusal = thing.refusal(self)
+                refusal = refusal_of(thing, self)
             except InputError as error:
                 yield path, str(error)
             else:

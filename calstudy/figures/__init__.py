@@ -303,6 +303,8 @@ def figure_task(
             for label, graph in members.items()
             for name, task in figure.inputs(graph).items()
         }
+    if wrong := {name: made for name, made in inputs.items() if not isinstance(made, Task)}:
+        raise InputError(f"{figure.label}: inputs returned {wrong!r}; tasks are needed, such as those of the graph")
     if settings is None and "" not in members:
         layouts = {label: graph.experiment.instrument.layout for label, graph in members.items()}
         settings = {"layouts": layouts, **({"members": own} if any(own.values()) else {})}

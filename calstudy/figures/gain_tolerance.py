@@ -201,7 +201,7 @@ class GainTolerance(StudyFigure):
     # Published tolerances are settings since 2.
     version: ClassVar[int] = 3
     kind: str = "gain-tolerance"
-    published: Annotated[tuple[PublishedTolerance, ...], Field(strict=False)] = Field(
+    published: tuple[PublishedTolerance, ...] = Field(
         (), description="Tolerances to compare with, drawn as dotted lines."
     )
 

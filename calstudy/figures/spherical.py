@@ -217,7 +217,6 @@ def add_legend(figure: style.Figure, entries: Mapping[str, Any], ncols: int, **t
 
 LimitsTable = Annotated[
     Path,
-    Field(strict=False),
     BeforeValidator(lambda value: published_limits() if value == PUBLISHED else value),
     PlainSerializer(lambda path: PUBLISHED if path == published_limits() else str(path), str, when_used="json"),
 ]

@@ -19,8 +19,8 @@ from calstudy.base.units import Angle, Fraction, Length
 DIPOLES = 16
 FEEDS = ("x", "y")
 
-Antennas = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
-Dipoles = Annotated[tuple[Annotated[int, Field(ge=0, lt=DIPOLES)], ...], Field(strict=False)]
+Antennas = tuple[Annotated[int, Field(ge=0)], ...]
+Dipoles = tuple[Annotated[int, Field(ge=0, lt=DIPOLES)], ...]
 
 
 class PositionErrors(Section):

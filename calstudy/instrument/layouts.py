@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 FARTHEST, SMALLEST = 3e6, 1.0
 """Largest coordinate of an antenna, which geocentric ones exceed, and smallest width of three antennas or more, m."""
+RESOLVED = 1e-3
+"""Grid, m, on which no two antennas are at the same place."""
 NEARBY = 1.0
 """deg, by which a site may differ from the mean of the positions of its antennas."""
 
@@ -208,6 +210,9 @@ def require_valid(made: Layout, origin: str) -> None:
             f"{origin} has {count} numbers, {len(made.names)} names and positions of shape {shape}; at least two "
             "antennas are needed, each with a number, a name and east, north, up"
         )
+    kinds = [getattr(getattr(values, "dtype", None), "kind", "") for values in (made.numbers, made.enu)]
+    if kinds[0] not in ("i", "u") or kinds[1] not in ("i", "u", "f"):
+        raise InputError(f"{origin}: numbers must be an array of integers, and enu one of real numbers")
     numbers, names = made.numbers.tolist(), list(made.names)
     twice = [value for found in (numbers, names) for value, times in Counter(found).items() if times > 1]
     if bad := [number for number in numbers if number < 0] + twice:
@@ -220,8 +225,11 @@ def require_valid(made: Layout, origin: str) -> None:
             f"{np.ptp(made.enu, axis=0).max():.4g} m wide; give east, north and up of a place in the array, in metres, "
             "not in kilometres or from the centre of the Earth"
         )
-    order = np.lexsort(made.enu.T)
-    same = np.flatnonzero((np.diff(made.enu[order], axis=0) == 0).all(axis=1))
+    if "" in names:
+        raise InputError(f"{origin}: antenna {numbers[names.index('')]} has an empty name")
+    places = np.round(made.enu / RESOLVED)
+    order = np.lexsort(places.T)
+    same = np.flatnonzero((np.diff(places[order], axis=0) == 0).all(axis=1))
     if same.size:
         first, second = sorted(order[same[0] : same[0] + 2])
         raise InputError(

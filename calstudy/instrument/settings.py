@@ -122,7 +122,7 @@ class InstrumentSettings(Section):
     )
     channels: Channels = Channels()
     times: Times = Times()
-    polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(strict=False, min_length=1, max_length=2)] = Field(
+    polarizations: Annotated[tuple[Literal["xx", "yy"], ...], Field(min_length=1, max_length=2)] = Field(
         ("xx",), description="Linear polarizations, calibrated independently: xx (east-west dipoles), yy, or both."
     )
 

@@ -87,12 +87,11 @@ def _require_different(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     return paths
 
 
-DataFile = Annotated[Path, BeforeValidator(_find), Field(strict=False)]
+DataFile = Annotated[Path, BeforeValidator(_find)]
 DataFiles = Annotated[
     tuple[DataFile, ...],
     BeforeValidator(_as_list, json_schema_input_type=str | tuple[str, ...]),
     AfterValidator(_require_different),
-    Field(strict=False),
 ]
 
 
@@ -171,7 +170,7 @@ class DataSettings(Section):
 
     data: DataFiles = Field(min_length=1, description="A file or folder, or several that belong together.")
     select: Select = Select()
-    flag: Annotated[tuple[FrequencyRange, ...], Field(strict=False)] = Field(
+    flag: tuple[FrequencyRange, ...] = Field(
         (), description="Channels that are flagged, such as those of known interference: ['149.7 MHz..150.2 MHz']."
     )
     flag_interference: Annotated[

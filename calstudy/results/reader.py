@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 
 Read = TypeVar("Read")
-NO_SCORES = "the run has no scores of its calibration, or is of a version that wrote none"
+NO_SCORES = "the run has no scores of one calibration"
 NO_TRANSFER = "the run does not calibrate the same data with the EoR and without"
 
 

@@ -28,6 +28,7 @@ from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.quiet import errors_written_to, write_errors_to
 from calstudy.base.resources import Usage, cores, free_memory, parse_memory
+from calstudy.base.user_code import user_code
 from calstudy.run.provenance import git_commit, libraries, lineage, made_with, of_other_code, processor
 from calstudy.run.store import Product, Store, keep
 from calstudy.run.task import Task, unique
@@ -82,7 +83,7 @@ def perform(order: WorkOrder, warn: Callable[[str], None] = logger.warning) -> P
     """Make the ordered product, or return it if another run has made it meanwhile.
 
     Raises InputError if the worker has other code, an input was removed or damaged, the stage refuses a value, or the
-    store cannot be written. Any other error of a stage is a bug, and passes with its traceback.
+    store cannot be written, or a user's code fails. Any other error of a stage is a bug, and passes with its traceback.
     """
     store = Store(order.store)
     if not store.root.is_dir():
@@ -200,7 +201,7 @@ def _make(order: WorkOrder, store: Store) -> Product:
     logging.captureWarnings(True)
     with store.building(task.stage.name, order.key) as folder:
         # Most products of matrices are many and small: threads in each cost more than they gain.
-        with Usage() as usage, _warnings() as found, threadpool_limits(limits=1, user_api="blas"):
+        with Usage() as usage, _warnings() as found, threadpool_limits(limits=1, user_api="blas"), user_code():
             notes = task.given({name: product.path for name, product in inputs.items()}).make(folder)
         if found:
             notes = {**notes, "warnings": [*notes.get("warnings", ()), *dict.fromkeys(found)]}

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from calstudy.base.errors import InputError
-from calstudy.base.plugins import Plugin, Registry, guarded
+from calstudy.base.plugins import Plugin, Registry, guarded, refusal_of
 from calstudy.base.resources import Cost
 from calstudy.base.visibilities import require_rectangular, subset_template
 from calstudy.simulate.nodes import EXACT, Accuracy, integration_times, time_axis
@@ -133,10 +133,9 @@ def simulate_with(
     Raises InputError if the engine refuses or fails, or returns visibilities of another shape or that are not finite.
     """
     require_rectangular(template)
+    if (reason := refusal_of(engine, sky, beam, template)) is not None:
+        raise InputError(f"simulation.engine = {engine.label!r}: {reason}")
     with guarded(engine):
-        reason = engine.refusal(sky, beam, template)
-        if reason is not None:
-            raise InputError(f"simulation.engine = {engine.label!r}: {reason}")
         found = engine.interpolate(sky, beam, template, accuracy)
     shape = (template.Ntimes, template.Nbls, template.Nfreqs, template.Npols)
     if np.shape(found) != shape:

@@ -69,7 +69,7 @@ class GleamSources(PointSources):
 
     kind: Literal["gleam"]
     path: Path | None = Field(
-        None, strict=False, description="Catalogue file; default: the file stored by `calstudy data fetch gleam`."
+        None, description="Catalogue file; default: the file stored by `calstudy data fetch gleam`."
     )
 
     @model_validator(mode="after")
@@ -135,7 +135,7 @@ class FileSources(PointSources):
     """A catalogue in a format that pyradiosky reads: SkyH5, VOTable (`votable`), FHD .sav, text; or a CSV (`csv`)."""
 
     kind: Literal["file"]
-    path: Path = Field(strict=False)
+    path: Path
     votable: VotableColumns | None = Field(None, description="Required for a VOTable (.vot, .votable, .xml), ICRS.")
     csv: CsvColumns | None = Field(None, description="Required for a CSV (.csv).")
 
@@ -156,7 +156,7 @@ class CodeSources(Section):
     """
 
     kind: Literal["code"]
-    path: Path = Field(strict=False, description="Python file; a relative path starts at the experiment file.")
+    path: Path = Field(description="Python file; a relative path starts at the experiment file.")
     function: str = Field(description="Name of the function in it.")
     options: dict[str, Any] = Field(default_factory=dict, description="Given to the function as keyword arguments.")
 
@@ -238,7 +238,6 @@ class Eor(Section):
     pivot_k: float = Field(0.1, gt=0, description="Pivot of the power law, in 1/Mpc (no h).")
     path: Path | None = Field(
         None,
-        strict=False,
         description="For spectrum: table, a text file with k in h/Mpc and P(k) in mK^2 h^-3 Mpc^3 in two columns, for "
         "the redshift of the data. For spectrum: box, a coeval box or a lightcone saved by 21cmFAST 3 or 4, whose P(k) "
         "is used as such a table. P is a power law between two k, and constant beyond the first and the last.",

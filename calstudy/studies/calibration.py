@@ -167,7 +167,7 @@ class DataStudy(Study):
 class CalibrationFile(DataFile):
     """Measured data that are calibrated as a whole, and the results that are wanted; they go to `outputs.runs`."""
 
-    also: Annotated[tuple[GainFormat, ...], Field(strict=False)] = Field(
+    also: tuple[GainFormat, ...] = Field(
         (),
         description="Also write the gains as calfits, H5Parm, FITS of hyperdrive, or `.bin` of calibrate (mwaocal).",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import h5py
@@ -395,6 +396,24 @@ def test_a_power_beam_is_its_root_along_the_feed(tmp_path):
     expected = ShortDipoleBeam().to_uvbeam(freq_array=EVEN, **grid).data_array
     np.testing.assert_allclose((np.abs(found) ** 2).sum(axis=0), (np.abs(expected) ** 2).sum(axis=0), atol=1e-6)
     np.testing.assert_allclose(found[..., 0, :], expected[..., 0, :], atol=1e-6)
+    assert "within" not in beam.stand_in
+
+
+def test_the_note_on_a_beam_says_how_far_it_is_from_its_table(tmp_path):
+    """The root of an Airy disk's power has cusps at the nulls, where a smooth function of frequency cannot be right."""
+    grid = {"axis1_array": np.radians(np.arange(360.0)), "axis2_array": np.radians(np.arange(91.0))}
+    frequencies = np.arange(160e6, 206e6, 1e6)
+    disk = analytic_beam.AiryBeam(diameter=14.0)
+    table = disk.to_uvbeam(freq_array=frequencies, beam_type="power", **grid)
+    table.write_beamfits(tmp_path / "power.beamfits")
+    beam = make_beam(FileBeam(kind="beamfits", path=tmp_path / "power.beamfits"))
+    error = float(re.search(r"\(chebyshev: within ([\d.]+)% of the field at the zenith\)", beam.stand_in)[1])
+    inner = (frequencies > 166e6) & (frequencies < 199e6)
+    power = (np.abs(beam.at(frequencies[inner]).data_array[:, 0]) ** 2).sum(axis=0)
+    expected = np.sqrt(np.abs(table.data_array[0, 0, inner]))
+    # The note has two digits.
+    assert error == pytest.approx(100 * np.abs(np.sqrt(power) - expected).max(), abs=0.06)
+    assert error > 0.3
 
 
 def healpix_file(path, beam, **options):

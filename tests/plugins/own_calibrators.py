@@ -24,6 +24,8 @@ class KnownGains(Calibrator):
     fault: str = ""
 
     def refusal(self, frame, has_sky_model):
+        if self.fault == "refusal":
+            return False
         if frame.lengths.max() > self.max_length:
             return f"max_length: is exceeded by a baseline of {frame.lengths.max():.0f} m"
         return None if has_sky_model else "needs a sky model"

@@ -185,7 +185,7 @@ def test_the_calibrate_command_uses_it(reference, observed, tmp_path, capsys, mo
         ([], "needs a sky model"),
         (["--buffer", "50 ns"], "has no such key, but calamity, "),
         (["--expected-loss", "--sky-model", "sky.uvh5"], "--expected-loss: is known for fits by least squares"),
-        (["--set", "fault=value", "--sky-model", "sky.uvh5"], "line 44, in spoiled: ValueError: no such thing"),
+        (["--set", "fault=value", "--sky-model", "sky.uvh5"], "line 46, in spoiled: ValueError: no such thing"),
     ],
 )
 def test_the_calibrate_command_refuses_in_a_sentence(reference, observed, tmp_path, capsys, monkeypatch, options, told):
@@ -201,10 +201,10 @@ def test_the_calibrate_command_refuses_in_a_sentence(reference, observed, tmp_pa
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        ("exit", "known_gains.py line 42, in spoiled: it ended the process (sys.exit, status 5)"),
-        ("value", "known_gains.py line 44, in spoiled: ValueError: no such thing"),
-        ("type", "known_gains.py line 46, in spoiled: TypeError: object of type 'int' has no len()"),
-        ("interrupt", "known_gains.py line 74, in spoiled: it ended the process (KeyboardInterrupt)"),
+        ("exit", "known_gains.py line 44, in spoiled: it ended the process (sys.exit, status 5)"),
+        ("value", "known_gains.py line 46, in spoiled: ValueError: no such thing"),
+        ("type", "known_gains.py line 48, in spoiled: TypeError: object of type 'int' has no len()"),
+        ("interrupt", "known_gains.py line 76, in spoiled: it ended the process (KeyboardInterrupt)"),
     ],
 )
 def test_an_error_ends_a_run_with_the_line_of_the_users_code(tmp_path, capsys, fault, told):
@@ -298,7 +298,8 @@ def test_one_set_of_gains_for_each_solve(observed, tmp_path):
         ("status", "its status one of converged, max-steps, stalled, failed, skipped"),
         ("outcomes", "returns 3 outcomes for 2 solves"),
         ("multiply", "convention 'multiply'; it must be 'divide'"),
-        ("write", "line 48, in spoiled: ValueError: assignment destination is read-only"),
+        ("refusal", "known_gains: refusal returned False; return a sentence that says why, or None"),
+        ("write", "line 50, in spoiled: ValueError: assignment destination is read-only"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_a_sentence(observed, tmp_path, fault, told):

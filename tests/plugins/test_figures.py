@@ -38,7 +38,7 @@ class Broken(StudyFigure):
     fault: str = "raise"
 
     def inputs(self, graph):
-        return {}
+        return {"spectrum": "power"} if self.fault == "inputs" else {}
 
     def draw(self, job):
         if self.fault == "return":
@@ -205,6 +205,7 @@ def test_a_reference_whose_figure_is_gone_can_be_read(finished, tmp_path):
     [
         ("raise", "broken.py line 13, in draw: KeyError: 'no such array'"),
         ("return", "figure 'broken': draw returned a str, expected a Drawing"),
+        ("inputs", "broken: inputs returned {'spectrum': 'power'}; tasks are needed, such as those of the graph"),
     ],
 )
 def test_what_goes_wrong_in_it_is_told_with_its_line(folder, fault, told):

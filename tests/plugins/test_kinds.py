@@ -32,7 +32,7 @@ from calstudy.studies.kinds.experiment import Family
 
 
 class SeedsFile(Experiment):
-    seeds: tuple[int, ...] = Field(strict=False, min_length=2, description="Seeds of the EoR.")
+    seeds: tuple[int, ...] = Field(min_length=2, description="Seeds of the EoR.")
 
 
 class Power(StudyFigure):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from plugin_files import Plugged, make
+from tiny import tiny
 
 from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.visibilities import to_cube
@@ -86,3 +87,27 @@ def test_what_is_no_beam_is_refused(tmp_path, result, told):
     settings = validate({"name": "own", "instrument": {"beam": str(path)}}, tmp_path).instrument
     with pytest.raises(InputError, match=told):
         make_beam(settings.beam, settings.channels)
+
+
+@pytest.mark.parametrize(
+    ("at", "told"),
+    [
+        ("return self.analytic", "own.py line 12, in at: AttributeError: 'Failing' object has no attribute 'analytic'"),
+        ("raise KeyError('no frequency')", "own.py line 12, in at: KeyError: 'no frequency'"),
+    ],
+)
+def test_what_goes_wrong_while_a_stage_works_is_told_with_its_line(tmp_path, at, told):
+    """The engine that calls the beam is built in."""
+    (tmp_path / "own.py").write_text(
+        "from calstudy.instrument.beams import ExactBeam\nfrom calstudy.instrument.interface import BeamModel\n"
+        "from pyuvdata.analytic_beam import AiryBeam\n\nclass Failing:\n    name, stand_in = 'failing', None\n\n"
+        "    def __init__(self):\n        self.beam = ExactBeam(AiryBeam(diameter=4.0), 'airy', None)\n\n"
+        f"    def at(self, frequencies):\n        {at}\n\n"
+        "    def solid_angles(self, *given):\n        return self.beam.solid_angles(*given)\n\n"
+        "class Own(BeamModel):\n    def make(self, channels):\n        return Failing()\n"
+    )
+    content = tiny(tmp_path)
+    content["instrument"]["beam"] = "own.py"
+    with pytest.raises(InputError) as caught:
+        make([simulation.foregrounds(Graph(validate(content, tmp_path)))], tmp_path)
+    assert told in str(caught.value)

@@ -63,13 +63,19 @@ def test_it_decides_what_is_simulated(plugged):
         ("return self.flat(np.array([[0, 0], [9, 0], [0, 0.0]]))", "are in the same place"),
         ("self.flat(np.eye(2))", "make returned None; a Layout is needed"),
         ("return self.flat(np.random.default_rng().normal(0, 30, (7, 2)))", "other antennas at every call"),
-        ("return 1 / 0", r"own\.py line 6, in make: ZeroDivisionError"),
+        ("return self.flat(np.array([[0, 0], [9, 0], [0, 1e-7]]))", "are in the same place"),
+        ("return self.flat(np.array([[0, 0], [9, 9j]]))", "and enu one of real numbers"),
+        ("return replace(self.flat(3 * np.eye(2)), numbers=np.array([0.0, 1.5]))", "must be an array of integers"),
+        ("return replace(self.flat(3 * np.eye(2)), numbers=[0, 1])", "must be an array of integers"),
+        ("return replace(self.flat(3 * np.eye(2)), names=('a', ''))", "antenna 1 has an empty name"),
+        ("return 1 / 0", r"own\.py line 7, in make: ZeroDivisionError"),
     ],
 )
 def test_what_is_no_layout_is_refused_in_a_sentence(tmp_path, body, sentence):
     path = tmp_path / "own.py"
     path.write_text(
-        "import numpy as np\nfrom calstudy.instrument.layouts import ArrayLayout\n\n"
+        "from dataclasses import replace\nimport numpy as np\n"
+        "from calstudy.instrument.layouts import ArrayLayout\n\n"
         f"class Own(ArrayLayout):\n    def make(self):\n        {body}\n"
     )
     layout = InstrumentSettings.model_validate({"layout": str(path)}).layout

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from distributed.protocol.pickle import dumps, loads
+from pydantic import ValidationError
 from tiny import load, tiny
 
 from calstudy.base.errors import ExperimentError, InputError
@@ -105,6 +107,37 @@ def test_fields_of_lists_say_what_is_in_them(tmp_path):
     text = plugin_reference(path)
     assert "| `antennas` | list of whole numbers | required |" in text
     assert "| `limits` | list of numbers | null |" in text
+
+
+def test_lists_and_texts_of_a_file_become_tuples_sets_and_paths(tmp_path):
+    """In the settings of a plug-in as in those of calstudy, also where one is in another; numbers remain strict."""
+    (tmp_path / "table.txt").write_text("1\n")
+    (tmp_path / "typed.py").write_text(
+        "from pathlib import Path\nfrom calstudy.corrupt.interface import Effect\n\n\nclass Typed(Effect):\n"
+        "    table: Path\n    limits: tuple[float, ...] | None = None\n    pairs: dict[str, tuple[int, int]] = {}\n"
+        "    chosen: frozenset[int] = frozenset()\n\n    def apply(self, visibilities, observation, truth):\n"
+        "        return visibilities\n"
+    )
+    block = {"kind": "typed.py", "table": "table.txt", "limits": [1, 2.5], "pairs": {"a": [0, 1]}, "chosen": [3, 3]}
+    made = Effect.registry.make(block, folder=tmp_path)
+    assert (made.table, made.limits) == (tmp_path / "table.txt", (1.0, 2.5))
+    assert (made.pairs, made.chosen) == ({"a": (0, 1)}, {3})
+    assert loads(dumps(made)) == made
+    for wrong in ({"limits": ["1"]}, {"pairs": {"a": [0, "1"]}}, {"limits": 3}, {"table": 3}):
+        with pytest.raises(ValidationError):
+            Effect.registry.make({**block, **wrong}, folder=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["model_post_init", "__init__"])
+def test_an_error_of_a_plugins_own_start_names_its_line(tmp_path, name):
+    given = "self, context" if name == "model_post_init" else "self, **given"
+    (tmp_path / "started.py").write_text(
+        "from calstudy.corrupt.interface import Effect\n\n\nclass Started(Effect):\n"
+        f"    def {name}({given}):\n        {{}}['absent']\n\n"
+        "    def apply(self, visibilities, observation, truth):\n        return visibilities\n"
+    )
+    with pytest.raises(InputError, match=rf"started\.py line 6, in {name}: KeyError: 'absent'"):
+        Effect.registry.make("started.py", folder=tmp_path)
 
 
 def test_the_notebooks_calibrator_finds_the_gains(template):

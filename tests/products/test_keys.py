@@ -273,8 +273,8 @@ def test_a_plug_in_counts_with_the_modules_that_a_package_of_its_folder_imports(
 def test_a_file_that_a_plug_in_names_by_default_counts_by_its_content(tmp_path):
     (tmp_path / "table.txt").write_text("0.5")
     (tmp_path / "quieter.py").write_text(
-        "from pathlib import Path\nfrom pydantic import Field\nfrom calstudy.corrupt.interface import Effect\n\n\n"
-        f"class Quieter(Effect):\n    table: Path = Field(Path({str(tmp_path / 'table.txt')!r}), strict=False)\n\n"
+        "from pathlib import Path\nfrom calstudy.corrupt.interface import Effect\n\n\n"
+        f"class Quieter(Effect):\n    table: Path = Path({str(tmp_path / 'table.txt')!r})\n\n"
         "    def apply(self, visibilities, observation, truth):\n        return visibilities\n"
     )
 

@@ -177,6 +177,12 @@ def test_the_answer_is_on_the_report_and_in_python(compared, summaries):
     assert found.transfer["CALAMITY"] == lowest
     with pytest.raises(InputError, match="limit = 0: must be greater than 0"):
         calstudy.open_run(compared.folder).standings(limit=0)
+    with pytest.raises(InputError, match="limit = 'small': must be greater than 0"):
+        calstudy.open_run(compared.folder).standings(limit="small")
+    with pytest.raises(InputError, match=r"worlds = 'ideal': must be a list of names, such as \['ideal'\]"):
+        calstudy.open_run(compared.folder).standings(worlds="ideal")
+    with pytest.raises(InputError, match="has no spectra by variant; its numbers are in its tables"):
+        _ = calstudy.open_run(compared.folder).spectra
     assert calstudy.open_run(compared.folder).standings(limit=1e9).loc[(0.2, 0.5)].standing["sky-based"] == "passes"
     page = (compared.folder / "report.html").read_text()
     assert page.index("Which calibrator to trust") < page.index("Scores: ideal")

@@ -86,13 +86,12 @@ class ByFile(Calibrator):
     chunks: int = Field(1, ge=1, description="Pieces of consecutive integrations.")
     folder: Path | None = Field(
         None,
-        strict=False,
         description="Folder of gains with the manifest.json of the export, or of such folders for several worlds.",
         json_schema_extra=FOLDER,
     )
-    gains: Path | None = Field(None, strict=False, description="In place of a folder, a file of gains for all data.")
+    gains: Path | None = Field(None, description="In place of a folder, a file of gains for all data.")
     model: Path | None = Field(
-        None, strict=False, description="Visibilities of the foregrounds, Jy, besides `gains`; null: the sky model."
+        None, description="Visibilities of the foregrounds, Jy, besides `gains`; null: the sky model."
     )
 
     salt: str = Field("", description="Of the blind challenge that the data are of.", json_schema_extra=UNKEYED)

@@ -65,7 +65,7 @@ class Redcal(OtherPackage):
         description="Baselines whose vectors agree within a quarter of this are redundant; those that differ by more "
         "than half of it are not (a grid of pyuvdata).",
     )
-    steps: Annotated[tuple[Step, ...], Field(strict=False, min_length=1)] = Field(
+    steps: Annotated[tuple[Step, ...], Field(min_length=1)] = Field(
         STEPS,
         description="What is done: a delay and a phase per antenna; a linear fit of logarithms; a fit of the "
         "visibilities themselves; amplitude and phase gradient from the sky model. Any of them, in this order.",

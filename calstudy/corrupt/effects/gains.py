@@ -197,7 +197,7 @@ class FileGains(GainEffect):
     """
 
     kind: str = "file-gains"
-    path: Path = Field(strict=False, description="File of gains, relative to the experiment file or absolute.")
+    path: Path = Field(description="File of gains, relative to the experiment file or absolute.")
 
     def gains(self, observation: Observation, random: np.random.Generator) -> np.ndarray:
         """Return the gains, shape (Nants, Nfreqs, 1 or Ntimes, Npols).

@@ -40,7 +40,7 @@ class CsvLayout(ArrayLayout):
     site: ClassVar[str | None] = None
 
     kind: str = "csv"
-    path: Path = Field(strict=False, description="The table, relative to the experiment file or absolute.")
+    path: Path = Field(description="The table, relative to the experiment file or absolute.")
 
     @property
     def origin(self) -> str:

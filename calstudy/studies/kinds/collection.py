@@ -36,7 +36,7 @@ class Member(Section):
     # The file is read as that of a study, and named in messages as it is written.
     holds_input_files: ClassVar[bool] = False
 
-    file: Path = Field(strict=False, description="The experiment file; a relative path starts at the collection file.")
+    file: Path = Field(description="The experiment file; a relative path starts at the collection file.")
     name: StudyName | None = Field(None, description="Replaces the experiment's own name.")
     overrides: dict[str, Any] = Field(
         default_factory=dict,
@@ -56,7 +56,7 @@ class CollectionFile(Section):
 
     name: StudyName = Field(description="Names the folder of the combined figures and claims.")
     description: str = ""
-    experiments: Annotated[tuple[MemberOrFile, ...], Field(strict=False, min_length=1)] = Field(
+    experiments: Annotated[tuple[MemberOrFile, ...], Field(min_length=1)] = Field(
         description="Experiment files, each with its own run folder."
     )
     figures: Figures = Field((), description="Figures that compare members, such as layouts and spherical-comparison.")

@@ -86,7 +86,7 @@ class ComparisonFile(Section):
 
     name: StudyName
     description: str = ""
-    experiment: Annotated[Path, Field(strict=False)] | dict[str, Any] = Field(
+    experiment: Path | dict[str, Any] = Field(
         description="The experiment that all cases start from: a file, whose relative path starts at this one, or the "
         "experiment itself."
     )

@@ -39,7 +39,7 @@ class RowsOfEight(Section):
 
     antennas: Annotated[
         tuple[Annotated[int, Field(ge=9)], ...],
-        Field(strict=False, min_length=3, description="Sizes, increasing."),
+        Field(min_length=3, description="Sizes, increasing."),
         AfterValidator(_increasing),
     ] = (16, 24, 32, 48, 64, 96, 128)
     spacing: Length = Field(2.0, gt=0, description="Distance between neighbours in a row.")
@@ -59,7 +59,7 @@ class Line(Section):
 
     lengths: Annotated[
         tuple[Annotated[Length, Field(gt=0)], ...],
-        Field(strict=False, min_length=3, description="Longest baselines, increasing."),
+        Field(min_length=3, description="Longest baselines, increasing."),
         AfterValidator(_increasing),
     ] = (20.0, 35.0, 50.0, 75.0, 100.0, 150.0, 200.0)
     count: int = Field(10, ge=3, description="Antennas of each.")
@@ -92,7 +92,7 @@ class RuntimeSettings(Section):
     basis: BasisSettings = BasisSettings()
     samples: SampleCounts = SampleCounts()
     descent: DescentSettings = DescentSettings()
-    devices: Annotated[tuple[Literal["cpu", "gpu"], ...], Field(strict=False, min_length=1)] = Field(
+    devices: Annotated[tuple[Literal["cpu", "gpu"], ...], Field(min_length=1)] = Field(
         ("cpu",), description="One core of the processor, in processor seconds; the first GPU, in elapsed seconds."
     )
 

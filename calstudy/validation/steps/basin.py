@@ -124,12 +124,10 @@ class BasinOfConvergence(SingleIntegrationStep):
         ),
     }
 
-    gain_errors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(
+    gain_errors: Annotated[tuple[float, ...], Field(min_length=1)] = Field(
         description="Standard deviations per channel, ascending."
     )
-    delays: Annotated[tuple[Delay, ...], Field(strict=False, min_length=1)] = Field(
-        description="Largest cable delays, ascending."
-    )
+    delays: Annotated[tuple[Delay, ...], Field(min_length=1)] = Field(description="Largest cable delays, ascending.")
     starts: Annotated[dict[str, Start], Field(min_length=1, max_length=3)] = Field(
         default_factory=_unity,
         description="By the names that they have in the figure; the first is that of the criteria.",

@@ -93,7 +93,7 @@ class Engines(Step):
         ),
     }
 
-    engines: Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+    engines: Annotated[tuple[str, ...], Field(min_length=1)]
     sources: int = Field(ge=1, description="Brightest sources of the whole sky.")
     antennas: int = Field(ge=2, le=36, description="First tiles of the minimally redundant array.")
     channels: int = Field(ge=1, description="Spread over the paper's band.")
