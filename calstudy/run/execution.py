@@ -273,8 +273,8 @@ class Budget:
     def __post_init__(self) -> None:
         if self.workers is not None and not (isinstance(self.workers, Integral) and self.workers >= 1):
             raise InputError(
-                f"workers = {self.workers!r}: must be a whole number of at least 1, or None for one per core and minute "
-                "of work"
+                f"workers = {self.workers!r}: must be a whole number of at least 1, or None for one per core and "
+                "minute of work"
             )
         if self.max_memory is not None and not isinstance(self.max_memory, str):
             raise InputError(f"max_memory = {self.max_memory!r}: must be a text with a unit, such as '6 GB'")
