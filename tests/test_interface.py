@@ -288,6 +288,9 @@ def test_damaged_tables_are_named_with_the_remedy(run, tmp_path):
             read()
     with pytest.raises(InputError, match=r"tables\.json: is damaged"):
         write_report(damaged.folder)
+    (damaged.folder / "tables" / "score.json").unlink()
+    with pytest.raises(InputError, match=r"score\.json: is missing, and the run wrote it; run the experiment again"):
+        _ = calstudy.open_run(tmp_path / "run").scores
     shutil.rmtree(damaged.folder / "tables")
     assert damaged.tables == []
 

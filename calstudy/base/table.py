@@ -95,7 +95,7 @@ def from_json(text: str) -> list[Table]:
 def plain_text(text: str) -> str:
     """Return a text in one line, without tags and entities of HTML but with its Markdown."""
     text = "".join(letter if letter.isprintable() else " " for letter in text)
-    return re.sub(r"&(?=#?\w+;)", "&amp;", re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text))
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", re.sub(r"&(?=#?\w+;)", "&amp;", text))
 
 
 def one_line(text: str) -> str:

@@ -268,7 +268,7 @@ def _results(run: RunFolder, named: Sequence[Paper]) -> Results | PooledResults:
     experiment = run.experiment(without=("papers",) if named else ())
     if experiment.realizations:
         return PooledResults.of(experiment, run.figures)
-    return Results(run.tables.folders, experiment)
+    return Results(run.tables.folders, experiment, lost=run.tables.lost)
 
 
 REALIZATIONS = "realizations"

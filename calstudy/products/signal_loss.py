@@ -299,7 +299,8 @@ class SweepSummary(Task, stage="sweep-summary", version=3):
                     band = f"k = {float(row['k from [h/Mpc]']):g} to {float(row['k to [h/Mpc]']):g} h/Mpc"
                     free = [float(row[f"transfer without flux scale{column}"]) for column in ("", " error")]
                     given = [float(row[f"transfer{column}"]) for column in ("", " error")]
-                    cell = _with_error(*(free if math.isfinite(free[0]) else given))
+                    number = free if math.isfinite(free[0]) else given
+                    cell = marked(_with_error(*number), *number) if math.isfinite(number[0]) else "-"
                     points.setdefault(row["point"], {})[band] = cell
         bands = list(dict.fromkeys(band for found in points.values() for band in found))
         rows = [(point, *(found[band] for band in bands)) for point, found in points.items()]

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calstudy.base.errors import InputError
 from calstudy.base.table import number, two_digits
 from calstudy.power.score import HEADLINE_BAND
 from calstudy.products.files import SCORE
 from calstudy.results.reader import RunFolder
 from calstudy.verdicts.standing import SIGMAS, marked, why_not_measured
+from calstudy.verdicts.statement import Unevaluated
 from calstudy.verdicts.tables import counts, outcomes_of_sentences
 
 MEASURED_BAND = (0.3, 0.5)
@@ -87,7 +87,7 @@ def read_signal(run: RunFolder) -> Signal | None:
     """Return T and bias of a run, or None if it has no scores or no EoR in the band."""
     try:
         score = run.tables.score_in_bands
-    except InputError:
+    except Unevaluated:
         return None
     band = int(np.argmin(np.abs(score.bin_edges[:-1] - HEADLINE_BAND[0])))
     bands = run.tables.summary["bands"] if run.tables.has(SCORE) else ()

@@ -200,6 +200,7 @@ def read_contents(run: RunFolder) -> Contents:
         _stages(run.products),
     ]
     signal = read_signal(run)
+    lost = [f"missing, and written by the run: {', '.join(run.lost)}; run it again"] if run.lost else []
     excess = [signal.excess] if signal is not None and signal.excess else []
     return Contents(
         title=run.name,
@@ -207,7 +208,7 @@ def read_contents(run: RunFolder) -> Contents:
         setup=manifest.get("setup", ""),
         facts=_facts(manifest),
         stand_ins=manifest.get("stand_ins", []),
-        warnings=[*excess, *manifest.get("warnings", []), *recorded_warnings(run.products)],
+        warnings=[*lost, *excess, *manifest.get("warnings", []), *recorded_warnings(run.products)],
         pictures=_pictures(run),
         tables=[table for table in tables if table is not None],
         headline=read_headline(run),

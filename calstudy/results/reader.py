@@ -77,9 +77,13 @@ def _undamaged(path: Path, read: Callable[[Path], Read], remedy: str = AGAIN) ->
 
 @dataclass(frozen=True)
 class Tables:
-    """Tables of one run, in one folder of all tables or in those of the products."""
+    """Tables of one run, in one folder of all tables or in those of the products.
+
+    `lost` are the names of those that the run wrote, and that are not there.
+    """
 
     folders: tuple[Path, ...]
+    lost: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
 
     def spherical(self, variant: str, modes: str) -> SphericalSpectrum:
         """Return the spherical spectrum of a variant, over "all-modes" or "outside-wedge"."""
@@ -149,7 +153,7 @@ class Tables:
         """Return the path of a table; raises Unevaluated with the sentence `missing` if no folder has it."""
         found = next((folder / name for folder in self.folders if (folder / name).is_file()), None)
         if found is None:
-            raise Unevaluated(missing)
+            raise Unevaluated(f"{name}: is missing, and the run wrote it; {AGAIN}" if name in self.lost else missing)
         return found
 
     def _spectrum(self, variant: str, kind: str, cls: type[Stored]) -> Stored:
@@ -349,8 +353,19 @@ class RunFolder:
         if not (self.path / "tables").is_dir():
             collected = self.manifest.get("members") if (self.path / MANIFEST).is_file() else None
             remedy = "give the folder of one of its members" if collected else AGAIN
-            raise InputError(f"{self.path}: has no tables; {remedy}")
-        return Tables((self.path / "tables",))
+            raise Unevaluated(f"{self.path}: has no tables; {remedy}")
+        return Tables((self.path / "tables",), lost=tuple(name for name in self._tables if name in self.lost))
+
+    @property
+    def _tables(self) -> list[str]:
+        return [name for entry in self.products for name in entry.get("files", ())]
+
+    @property
+    def lost(self) -> list[str]:
+        """Names of the tables and figures that the run wrote, by its manifest, and that are not in its folder."""
+        drawn = [f"{entry['label']}.png" for entry in self.products if entry.get("stage") == "figure"]
+        places = {self.path / "tables": self._tables, self.figures: drawn}
+        return [name for folder, names in places.items() for name in names if not (folder / name).is_file()]
 
     @property
     def shown(self) -> list[Table]:

@@ -106,7 +106,7 @@ class Study(ABC):
     heading, guide : of the kind in the reference of all fields, and what is written there about its files
     subfolders : folders in the run folder besides figures and tables
     keeps_tables
-        True if the manifest lists the files of the tables with digests, so that a collection can take them from there.
+        True if a collection can take the tables from a finished run.
     has_reference : true if figures and claims of a run may be a reference for `calstudy regress`
     """
 
@@ -269,9 +269,7 @@ class Study(ABC):
             **({"parts": places} if places else {}),
             **self.entries,
             "warnings": removed((task for task in self.recorded if task.key not in self.external_keys), made.products),
-            "products": product_entries(
-                self.recorded, made.products, made.tasks, self.tables if self.keeps_tables else ()
-            ),
+            "products": product_entries(self.recorded, made.products, made.tasks, self.tables),
         }
         write_manifest(self.folder, self.name, entries)
 

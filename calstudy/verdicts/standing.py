@@ -199,10 +199,10 @@ class InBand:
 
     @property
     def numbers(self) -> str:
-        """The upper limit of the bias in all worlds, the smallest T, and how many solves did not converge."""
+        """The upper limit of the bias in all worlds, the smallest T, and how many solves of data did not converge."""
         limit = self.upper_limit
         bias = "bias or its error not known" if math.isnan(limit) else f"bias < {two_digits(limit)}"
-        count = sum(sum(world.solves.values()) for world in self.worlds)
+        count = sum(sum(world.solves.values()) - world.solves.get("skipped", 0) for world in self.worlds)
         rest = count - sum(settled(world.solves) for world in self.worlds)
         return f"{bias}, {self.kept}" + (f", {rest} of {count} solves not converged" if rest else "")
 
@@ -280,16 +280,15 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
     if passed:
         first, *others = passed
         parts, least = [f"take {first.calibrator} ({first.numbers})"], first.transfer + MORE
-        # A smaller bias may be known so much better that it alone is seen.
         seen = next((found for found in first.decisive if abs(found.bias) > SIGMAS * found.bias_error), None)
-        parts.append(f"its bias is largest in {seen.world} ({two_digits(seen.bias)})" if seen else "no bias is seen")
+        parts.append(f"a bias is seen in {seen.world} ({two_digits(seen.bias)})" if seen else "no bias is seen")
         parts += [f"others that pass: {_listed(others)}"] if others else []
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
     keeps = "keeps more" if passed else "keeps much"
     parts += [f"{entry.calibrator} {keeps} ({entry.kept}), but {entry}" for entry in tempting[:NAMED]]
-    rest = len(failed) - len(tempting[:NAMED])
-    return [*parts, f"{rest} of {len(entries)} fail"] if rest else parts
+    unnamed = len(failed) > len(tempting[:NAMED])
+    return [*parts, f"{len(failed)} of {len(entries)} fail"] if unnamed else parts
 
 
 def _listed(entries: Sequence[InBand]) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calstudy.base.errors import InputError
 from calstudy.power.score import Score
 from calstudy.power.tables import save_spectrum
 from calstudy.products.files import SCORE, SCORE_BANDS
@@ -73,6 +74,13 @@ def test_noise_above_the_eor_is_no_excess(tmp_path):
     assert read_signal(finished_run(tmp_path, scores(3.9e6, bias_error=1.1e6))).excess is not None
     # An error that is not known explains nothing.
     assert read_signal(finished_run(tmp_path, scores(5000, bias_error=np.nan))).excess is not None
+
+
+def test_damaged_scores_are_no_missing_ones(tmp_path):
+    run = finished_run(tmp_path, scores())
+    (tmp_path / "tables" / SCORE_BANDS).write_bytes(b"junk")
+    with pytest.raises(InputError, match="is damaged; run the experiment again"):
+        read_headline(run)
 
 
 def test_a_run_without_scores_has_no_headline(tmp_path):

@@ -215,14 +215,31 @@ def test_the_summary_of_a_sweep_is_shown_with_a_row_per_point(tmp_path):
             **{"transfer": value, "transfer error": 0.01},
             **{f"transfer without flux scale{column}": free for column in ("", " error")},
         }
-        for point, values, free in (("01-a", (0.5, 0.75), float("nan")), ("02-b", (0.25, 0.75), 0.1))
+        for point, values, free in (("01-a", (0.5, 7.9), float("nan")), ("02-b", (0.25, 0.75), 0.1))
         for region in ("outside-wedge", "inside-wedge")
         for value, band in zip(values, ((0.1, 0.2), (0.2, 0.3)), strict=True)
     ]
     Table.of_records(rows).write_csv(tmp_path / "summary.csv")
     (table,) = SweepSummary("all points", points={}, measured={}).shown(tmp_path)
     assert table.columns == ("point", "k = 0.1 to 0.2 h/Mpc", "k = 0.2 to 0.3 h/Mpc")
-    assert table.rows == [("01-a", "0.500 ± 0.010", "0.750 ± 0.010"), ("02-b", "0.100 ± 0.100", "0.100 ± 0.100")]
+    assert table.rows == [
+        ("01-a", "0.500 ± 0.010", "not measured (7.900 ± 0.010)"),
+        ("02-b", "0.100 ± 0.100", "0.100 ± 0.100"),
+    ]
+
+
+def test_what_the_run_wrote_and_is_gone_is_said(folder):
+    products = [
+        {"stage": "comparison", "files": {"comparison.json": ""}},
+        {"stage": "figure", "label": "wedge"},
+        {"stage": "figure", "label": "gains"},
+    ]
+    content = json.loads((folder / "manifest.json").read_text())
+    content["products"] = [{**content["products"][0], "label": "", **new} for new in products]
+    (folder / "manifest.json").write_text(json.dumps(content))
+    said = "missing, and written by the run: comparison.json, gains.png; run it again"
+    assert read_contents(RunFolder(folder)).warnings[0] == said
+    assert said in page_of(folder).words
 
 
 def test_a_sweep_and_a_collection_lead_to_the_reports_of_their_parts(folder):
