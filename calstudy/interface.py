@@ -267,8 +267,8 @@ class LoadedStudy:
     def plan(self, workers: int | None = None, max_memory: str | None = None) -> StudyPlan:
         """Return the stages of a run with the estimated time, memory and disk.
 
-        By default there is a worker process for each core and minute of work, as far as the memory allows.
-        `max_memory` is that of all workers together, such as "6 GB"; by default all free memory.
+        By default there is a worker process for each core, as far as the memory allows. `max_memory` is that of all
+        workers together, such as "6 GB"; by default all free memory.
         """
         return StudyPlan(describe_plan(self._study, Budget(workers, max_memory)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from calstudy.base.plugins import Plugin
-from calstudy.base.schema import REVISED, defaults
+from calstudy.base.schema import NAMES_FILES, REVISED, defaults
 from calstudy.base.user_code import digest_file, identity_of_file
 
 
@@ -37,6 +38,16 @@ def _identity_of_folder(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): f"sha256:{digest_file(path)}" for path in files}
 
 
+def _with_files(value: Any) -> Any:
+    """Return a block with paths in place of texts that name existing files."""
+    if isinstance(value, Mapping):
+        return {name: _with_files(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_files(item) for item in value]
+    # Of a name that is too long, Path.is_file raises OSError.
+    return Path(value) if isinstance(value, str) and os.path.isfile(value) else value  # noqa: PTH113
+
+
 def _identity_of_section(section: BaseModel) -> dict[str, Any]:
     found: dict[str, Any] = {}
     fields = type(section).model_fields
@@ -47,7 +58,7 @@ def _identity_of_section(section: BaseModel) -> dict[str, Any]:
         elif isinstance(extra, dict) and extra.get("keyed") is False:
             continue
         elif value != default or (isinstance(value, Path) and value.exists()):
-            content = identity(value)
+            content = identity(_with_files(value) if extra == NAMES_FILES else value)
             # A block with the identity of the default is left out as well.
             if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):
                 version = extra.get(REVISED) if isinstance(extra, dict) else None

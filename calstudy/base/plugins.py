@@ -33,12 +33,23 @@ FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]
 class Plugin(Section):
     """The base class of all plug-ins. Subclasses declare settings as fields, and behaviour as methods.
 
-    The base class of each kind sets the `registry`. The version of a built-in plug-in is increased whenever its results
-    change, so that the products that depend on it are made again.
+    The base class of each kind sets the `registry`, and `inherited_with`: each method of its keys is inherited only
+    together with the method of the value, which it may bypass; otherwise that of the base class is used, which calls
+    it. The version of a built-in plug-in is increased whenever its results change, so that the products that depend on
+    it are made again.
     """
 
     registry: ClassVar[Registry]
     version: ClassVar[int] = 1
+    inherited_with: ClassVar[Mapping[str, str]] = {}
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **given: Any) -> None:
+        """Replace methods that would bypass one that the class overrides."""
+        super().__pydantic_init_subclass__(**given)
+        for name, other in cls.inherited_with.items():
+            if other in vars(cls) and name not in vars(cls):
+                setattr(cls, name, getattr(cls.registry.base, name))
 
     @property
     def reference(self) -> str:

@@ -30,6 +30,8 @@ UNKEYED: JsonDict = {"keyed": False}
 """`json_schema_extra` of a field that affects how results are computed, but not their values (except for rounding)."""
 REVISED = "revised"
 """Key of `json_schema_extra`: the version of the results of a field's values other than its default."""
+NAMES_FILES: JsonDict = {"names_files": True}
+"""`json_schema_extra` of a block for a user's code, whose texts may be the paths of files that the code reads."""
 FOLDER: JsonDict = {"folder": True}
 """`json_schema_extra` of a path that is a folder of input files."""
 NESTED = "nested"

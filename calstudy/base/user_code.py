@@ -9,7 +9,7 @@ import importlib.util
 import inspect
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.abc import MetaPathFinder
@@ -118,15 +118,15 @@ def _imported(path: Path, package: str = "", in_functions: bool = False) -> Iter
             yield from (".".join(parts[: count + 1]) for count in range(len(parts)))
 
 
-def load_file(path: Path) -> ModuleType:
-    """Run a Python file as a module, once for each version of its content, and return the module.
+def load_file(path: Path, anew: bool = False) -> ModuleType:
+    """Run a Python file as a module, once for each version of its content, or `anew`, and return the module.
 
     It can import modules of its folder, which are then run again. Raises InputError if the file cannot be read or is
     not valid Python, if running it raises an error (the message names the line), or if code of files is refused.
     """
     content, beside = _read_code(path)
     name = f"{FILE_MODULE}{path.stem}_{hashlib.sha256(f'{path}{content}'.encode()).hexdigest()[:12]}"
-    if name in sys.modules:
+    if name in sys.modules and not anew:
         return sys.modules[name]
     loader = _Uncompiled(name, str(path.absolute()))
     spec = importlib.util.spec_from_file_location(name, path, loader=loader)
@@ -230,9 +230,23 @@ def _read_code(path: Path) -> tuple[str, dict[str, Path]]:
     raise InputError(f"{str(path)!r} {fault}")
 
 
-def load_function(path: Path, name: str) -> Callable[..., Any]:
-    """Return a function that a Python file defines; raises InputError if it does not, or cannot be run."""
-    module = load_file(path)
+def files_of_class(cls: type) -> list[Path]:
+    """Return the users' files in which functions of a class and its bases are defined."""
+    spaces = [item.__globals__ for kind in cls.__mro__ for item in vars(kind).values() if inspect.isfunction(item)]
+    return sorted({Path(space["__file__"]) for space in spaces if _is_of_file(space)})
+
+
+def _is_of_file(space: Mapping[str, Any]) -> bool:
+    """Return whether the globals of a function are those of a module that was read from a user's file."""
+    return isinstance(getattr(space.get("__spec__"), "loader", None), _Uncompiled)
+
+
+def load_function(path: Path, name: str, anew: bool = False) -> Callable[..., Any]:
+    """Return a function that a Python file defines; raises InputError if it does not, or cannot be run.
+
+    With `anew` the file is run again, as another process would.
+    """
+    module = load_file(path, anew)
     functions = {
         key: value
         for key, value in vars(module).items()
@@ -253,8 +267,9 @@ def user_code(name: str = "") -> Iterator[None]:
     """Run a user's code; its errors, SystemExit included, become a `UserCodeError` that names the line, or else `name`.
 
     `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
-    defects of calstudy, except where the call itself, of `name`, does not fit the user's function. KeyboardInterrupt
-    passes in the main thread, where it is Ctrl-C.
+    defects of calstudy, except where the call itself does not fit the user's function. KeyboardInterrupt passes in the
+    main thread, where it is Ctrl-C. Without a `name` the code may be anybody's: lines are then those of plug-ins in
+    files alone.
     """
     try:
         yield
@@ -263,12 +278,16 @@ def user_code(name: str = "") -> Iterator[None]:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
             raise
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
+        frames = [
+            (frame.f_code, line)
+            for frame, line in traceback.walk_tb(error.__traceback__)
+            if (_is_users(frame.f_code.co_filename) if name else _is_of_file(frame.f_globals))
+        ]
         if not frames and not (name and isinstance(error, TypeError | SystemExit | ImportError)):
             raise
         if frames:
-            last = frames[-1]
-            name = f"{Path(last.filename).name} line {last.lineno}, in {last.name}"
+            code, line = frames[-1]
+            name = f"{Path(code.co_filename).name} line {line}, in {code.co_name}"
         if isinstance(error, SystemExit | KeyboardInterrupt):
             how = f"sys.exit, status {error.code}" if isinstance(error, SystemExit) else "KeyboardInterrupt"
             text = f"it ended the process ({how}); raise an error instead"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, cast
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from calstudy.base.plugins import Plugin, guarded
 from calstudy.experiment.model import PAPERS, Experiment
@@ -33,12 +34,19 @@ class Paper(Plugin):
     roles: ClassVar[Mapping[str, str]] = {}
     usual_members: ClassVar[Mapping[str, str]] = {}
     own_solver_roles: ClassVar[Mapping[str, str]] = {}
+    module: ClassVar[ModuleType]
 
     kind: str
 
+    @classmethod
+    def __pydantic_init_subclass__(cls, **given: Any) -> None:
+        """Keep the module of a class: another file may import another module of this name later."""
+        super().__pydantic_init_subclass__(**given)
+        cls.module = sys.modules[cls.__module__]
+
     def statements(self) -> Sequence[Statement]:
         """Return the statements, in the order of the paper; by default those in the module of the class or a base."""
-        modules = [sys.modules[kind.__module__] for kind in type(self).__mro__]
+        modules = [vars(kind)["module"] for kind in type(self).__mro__ if "module" in vars(kind)]
         found = ([item for item in vars(module).values() if isinstance(item, Statement)] for module in modules)
         return next(filter(None, found), [])
 

@@ -25,10 +25,7 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE", help="Override a field: --set calibration.basis.buffer='200 ns'."),
 ]
-Workers = Annotated[
-    int | None,
-    typer.Option(min=1, help="Worker processes; by default one per core and minute of work, within the memory."),
-]
+Workers = Annotated[int | None, typer.Option(min=1, help="Worker processes; by default one per core that has memory.")]
 MaxMemory = Annotated[
     str | None,
     typer.Option(metavar="SIZE", help="Memory for all workers together, such as '6 GB'; by default what is free."),

@@ -35,6 +35,7 @@ class Effect(Plugin, ABC):
         "effect", "calstudy.corrupt.effects", "calstudy.corrupt.interface:Effect", families=True
     )
 
+    inherited_with: ClassVar = {"can_flag": "flags"}
     uses_positions: ClassVar[bool] = True
 
     kind: str = Field("", description="Name of an effect, or a file.py.")

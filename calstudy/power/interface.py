@@ -38,6 +38,7 @@ class Estimator(Plugin, ABC):
     """An estimator of delay power spectra. Fields of a subclass are its settings."""
 
     registry: ClassVar = ESTIMATORS
+    inherited_with: ClassVar = {"estimate_and_export": "estimate"}
 
     kind: str = Field("", description="Name of an estimator, or a file.py.")
     largest_antenna: ClassVar[int | None] = None

@@ -354,17 +354,13 @@ class RunFolder:
             collected = self.manifest.get("members") if (self.path / MANIFEST).is_file() else None
             remedy = "give the folder of one of its members" if collected else AGAIN
             raise Unevaluated(f"{self.path}: has no tables; {remedy}")
-        return Tables((self.path / "tables",), lost=tuple(name for name in self._tables if name in self.lost))
-
-    @property
-    def _tables(self) -> list[str]:
-        return [name for entry in self.products for name in entry.get("files", ())]
+        return Tables((self.path / "tables",), lost=tuple(self.lost))
 
     @property
     def lost(self) -> list[str]:
         """Names of the tables and figures that the run wrote, by its manifest, and that are not in its folder."""
         drawn = [f"{entry['label']}.png" for entry in self.products if entry.get("stage") == "figure"]
-        places = {self.path / "tables": self._tables, self.figures: drawn}
+        places = {self.path / "tables": self.manifest.get("tables", ()), self.figures: drawn}
         return [name for folder, names in places.items() for name in names if not (folder / name).is_file()]
 
     @property

@@ -260,9 +260,9 @@ class Schedule:
 class Budget:
     """Resources of a run.
 
-    Without a number of workers there is one for each core and minute of work, within the memory; `max_memory` of all
-    workers together is such as "6 GB", by default all that is free. That of a running dask scheduler is not checked. A
-    `strict` run also makes products of other code or other versions of packages again.
+    Without a number of workers there is one for each core within the memory; `max_memory` of all workers together is
+    such as "6 GB", by default all that is free. That of a running dask scheduler is not checked. A `strict` run also
+    makes products of other code or other versions of packages again.
     """
 
     workers: int | None = None
@@ -273,8 +273,7 @@ class Budget:
     def __post_init__(self) -> None:
         if self.workers is not None and not (isinstance(self.workers, Integral) and self.workers >= 1):
             raise InputError(
-                f"workers = {self.workers!r}: must be a whole number of at least 1, or None for one per core and "
-                "minute of work"
+                f"workers = {self.workers!r}: must be a whole number of at least 1, or None for one per core"
             )
         if self.max_memory is not None and not isinstance(self.max_memory, str):
             raise InputError(f"max_memory = {self.max_memory!r}: must be a text with a unit, such as '6 GB'")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
@@ -16,7 +15,7 @@ from calstudy.base.files import digest_json
 from calstudy.base.identity import identity
 from calstudy.base.resources import Cost
 from calstudy.base.table import Table
-from calstudy.base.user_code import FILE_MODULE, identity_of_file
+from calstudy.base.user_code import files_of_class, identity_of_file
 
 Input: TypeAlias = Annotated[Any, "Input"]
 """A product that another needs: its task in a plan, its folder where the other one is made.
@@ -140,12 +139,11 @@ class Task(Declared, ABC):
     def key(self) -> str:
         """The content address: a digest of stage, version, settings, the inputs' keys, and the stages of the pieces.
 
-        That of a product that a user's file defines has the content of the file as well.
+        That of a product that users' files define has the content of these files as well.
         """
         inputs = {name: task.key for name, task in self.inputs.items()}
         stages = sorted({task.stage for task in unique(self.pieces.values())})
-        module = sys.modules[type(self).__module__]
-        code = [identity_of_file(Path(str(module.__file__)))] if module.__name__.startswith(FILE_MODULE) else []
+        code = [identity_of_file(path) for path in files_of_class(type(self))]
         own = [*self.stage, self.content, inputs, *code]
         return digest_json([*own, stages] if stages else own)
 

@@ -54,6 +54,7 @@ class Engine(Plugin, ABC):
     registry: ClassVar[Registry[Engine]] = Registry(
         "engine", "calstudy.simulate.engines", "calstudy.simulate.interface:Engine", families=True
     )
+    inherited_with: ClassVar = {"interpolate": "simulate"}
 
     kind: str = Field("", description="Name of an engine, or a file.py.")
 

@@ -13,7 +13,7 @@ import healpy
 import numpy as np
 from astropy import constants, units
 from astropy.coordinates import FK4, SkyCoord
-from astropy.io import fits
+from astropy.io import fits, votable
 from pyradiosky import SkyModel
 from scipy.interpolate import RectBivariateSpline
 
@@ -41,6 +41,8 @@ from calstudy.sky.counts import BRIGHTEST, COUNTS_FREQUENCY, FREQUENCY, SPECTRAL
 from calstudy.sky.eor import draw_harmonics
 from calstudy.sky.spectra import at_frequencies, require_enclosed, span
 
+LONGEST_HEADER = 2**20
+"""Bytes of a VOTable in which its columns are described."""
 HASLAM_FREQUENCY = 408e6
 # The map is in tenths of a kelvin, on a grid of 20 arcmin in B1950 coordinates, its middle at (0, 0).
 HASLAM_UNIT, HASLAM_STEP = 0.1, np.deg2rad(1 / 3)
@@ -301,7 +303,8 @@ def _from_file(settings: section.FileSources, frequencies: np.ndarray) -> Foregr
         _require_in_band(sky, frequencies, settings.path)
     at_centre = _at_frequency(sky, float(np.mean(frequencies)))
     flux = at_centre.stokes[0, 0].to_value("Jy")
-    flux = np.where(np.isfinite(flux), flux, -np.inf)
+    known = np.isfinite([flux, sky.skycoord.spherical.lon.deg, sky.skycoord.spherical.lat.deg]).all(axis=0)
+    flux = np.where(known, flux, -np.inf)
     if flat:
         # All channels have the flux of the catalogue at the middle of the band.
         sky = make_points(sky.name, sky.skycoord, at_centre.stokes, {"spectral_type": "flat"})
@@ -324,10 +327,11 @@ def _require_in_band(sky: SkyModel, frequencies: np.ndarray, path: Path) -> None
 
 
 def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregrounds:
-    function = load_function(settings.path, settings.function)
     where = f"{settings.function} of {settings.path.name}"
     with user_code(where):
-        sky, again = (function(frequencies.copy(), **settings.options) for _ in range(2))
+        # The second one as in another process, which runs the file again.
+        functions = [load_function(settings.path, settings.function, anew) for anew in (False, True)]
+        sky, again = (function(frequencies.copy(), **settings.options) for function in functions)
     if not isinstance(sky, SkyModel) or sky.component_type != "point":
         raise InputError(f"sky.foregrounds: {where} must return a pyradiosky SkyModel of points")
     if sky != again:
@@ -381,6 +385,23 @@ def _require_idl(path: Path) -> None:
             raise ValueError("not an IDL save file")
 
 
+def _require_no_nulls(path: Path) -> None:
+    """Raise ValueError if entries of a VOTable have the null value of their column, which pyradiosky takes for data."""
+    with path.open("rb") as stream:
+        if not re.search(rb"<VALUES[^>]*\bnull=", stream.read(LONGEST_HEADER)):
+            return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        tables = [found.to_table() for found in votable.parse(str(path)).iter_tables()]
+    for name, column in ((name, found[name]) for found in tables for name in found.colnames):
+        values = np.ma.getdata(column)
+        if column.dtype.kind in "iuf" and (null := np.ma.getmaskarray(column) & np.isfinite(values)).any():
+            raise ValueError(
+                f"{null.sum()} entries of column {name} have its null value, {values[null][0]}; leave out their "
+                "rows, or leave these cells empty"
+            )
+
+
 def _read_votable(path: Path, columns: section.VotableColumns) -> SkyModel:
     frequency = None if columns.frequency is None else columns.frequency * units.Hz
     with warnings.catch_warnings():
@@ -416,7 +437,8 @@ def _read(settings: section.FileSources) -> SkyModel:
                 warnings.filterwarnings("ignore", message="Source IDs are not unique")
                 return SkyModel.from_fhd_catalog(str(path), expand_extended=False)
         if settings.votable is not None:
-            return _read_votable(path, settings.votable)
+            _require_no_nulls(path)
+            return _in_jansky(_read_votable(path, settings.votable))
         if settings.csv is not None:
             return read_csv_catalogue(path, settings.csv)
         _require_known_units(path)

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import default_directory
-from calstudy.base.schema import Section, choice, fault, folder_of_files
+from calstudy.base.schema import NAMES_FILES, Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 from calstudy.base.user_code import load_function
 
@@ -158,7 +158,11 @@ class CodeSources(Section):
     kind: Literal["code"]
     path: Path = Field(description="Python file; a relative path starts at the experiment file.")
     function: str = Field(description="Name of the function in it.")
-    options: dict[str, Any] = Field(default_factory=dict, description="Given to the function as keyword arguments.")
+    options: dict[str, Any] = Field(
+        default_factory=dict,
+        description="Given to the function as keyword arguments. Files that they name are known by their content.",
+        json_schema_extra=NAMES_FILES,
+    )
 
     @model_validator(mode="after")
     def _function_is_there(self, info: ValidationInfo) -> CodeSources:

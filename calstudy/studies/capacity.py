@@ -18,8 +18,6 @@ from calstudy.run.execution import Budget, schedule
 from calstudy.run.store import Store
 from calstudy.run.task import Task
 
-WORTH = 60.0
-"""Seconds of work for each worker that is started: loading the libraries takes one 10 s."""
 WORKERS_PER_CORE, LEAST_LIMIT = 4, 16
 """Limits of the number of workers, of which more than cores wait for each other."""
 ABSURD = 10
@@ -35,19 +33,16 @@ def fit(file: File, budget: Budget, targets: Callable[[File], Sequence[Task]]) -
 
     The number of chunks of a simulation changes its visibilities by less than the tolerance of their interpolation, and
     does not change their key in the store. The result is the file, perhaps with more `simulation.chunks` and a
-    calibrator that needs less memory, and the number of workers: the requested one if no memory was given, by default
-    one for each core and minute of work. Raises InputError if a single task is estimated to need more memory than there
-    is.
+    calibrator that needs less memory, and the number of workers, which is the requested one if no memory was given.
+    Raises InputError if a single task is estimated to need more memory than there is.
     """
     if budget.scheduler is not None:
         return file, budget.workers or 1
     _require_sane(budget)
     # The parent process has the libraries in memory, too.
     memory = budget.memory - LIBRARIES_MEMORY
-    work = _Work(file, targets, budget.strict)
-    minutes = sum(task.cost.seconds for task in work.missing) // WORTH
-    hoped = budget.workers or int(min(cores(), 1 + minutes))
-    lean = _stream(_cut(work, memory / hoped), memory / hoped)
+    hoped = budget.workers or cores()
+    lean = _stream(_cut(_Work(file, targets, budget.strict), memory / hoped), memory / hoped)
     return lean.file, _workers(lean.missing, memory, hoped, budget)
 
 
@@ -85,7 +80,7 @@ def _require_sane(budget: Budget) -> None:
     if budget.workers is not None and budget.workers > most:
         raise InputError(
             f"--workers {budget.workers}: at most {most} are allowed on this machine, which has {cores()} processor "
-            "core(s); leave it out for one per core and minute of work"
+            "core(s); leave it out for one per core"
         )
 
 

@@ -106,7 +106,7 @@ class Study(ABC):
     heading, guide : of the kind in the reference of all fields, and what is written there about its files
     subfolders : folders in the run folder besides figures and tables
     keeps_tables
-        True if a collection can take the tables from a finished run.
+        True if the manifest has digests of the tables, so that a collection can take them from there.
     has_reference : true if figures and claims of a run may be a reference for `calstudy regress`
     """
 
@@ -269,7 +269,10 @@ class Study(ABC):
             **({"parts": places} if places else {}),
             **self.entries,
             "warnings": removed((task for task in self.recorded if task.key not in self.external_keys), made.products),
-            "products": product_entries(self.recorded, made.products, made.tasks, self.tables),
+            "tables": [name for task in self.tables for name in made.products[task.key].record["files"]],
+            "products": product_entries(
+                self.recorded, made.products, made.tasks, self.tables if self.keeps_tables else ()
+            ),
         }
         write_manifest(self.folder, self.name, entries)
 

@@ -187,3 +187,13 @@ def test_what_it_does_wrong_is_said_in_a_sentence(tmp_path, monkeypatch, name, t
     with pytest.raises(InputError, match=told) as caught:
         apply_effect(effect, np.ones(observation.shape, complex), observation, draw_truth(effect, observation))
     assert isinstance(caught.value, UserCodeError) == (name in ("Raising", "Exiting"))
+
+
+def test_flags_of_a_subclass_are_asked_for(tmp_path):
+    (tmp_path / "flagging.py").write_text(
+        "import numpy as np\nfrom calstudy.corrupt.effects.losses import Decoherence\n\n\n"
+        "class Flagging(Decoherence):\n    kind: str = ''\n\n    def flags(self, observation, truth):\n"
+        "        return np.ones((1, 1, 1, 1), dtype=bool)\n"
+    )
+    assert Effect.registry.make({"kind": "flagging.py"}, folder=tmp_path).can_flag
+    assert not Effect.registry.make({"kind": "decoherence"}).can_flag

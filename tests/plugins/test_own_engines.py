@@ -60,3 +60,28 @@ def test_it_refuses_in_a_sentence(plugged):
     task = simulation.foregrounds(Graph(with_engine(plugged, plugged.settings(), polarizations=["xx", "yy"])))
     with pytest.raises(InputError, match=r"simulation\.engine = '\w.*': needs an unpolarized sky in xx"):
         make([task], plugged.folder)
+
+
+WITHOUT_FIRST = """
+from calstudy.simulate.engines.dense import {base}
+
+class WithoutFirst({base}):
+    kind: str = ""
+
+    def simulate(self, sky, beam, template):
+        cube = super().simulate(sky, beam, template)
+        cube[:, 0] = 0
+        return cube
+"""
+
+
+@pytest.mark.parametrize("base", ["DenseEngine", "FastestEngine"])
+def test_one_that_changes_a_built_in_simulation_is_interpolated_by_its_own(plugged, base):
+    """The built-in ones interpolate by themselves, and not by what they simulate."""
+    (plugged.folder / "without_first.py").write_text(WITHOUT_FIRST.format(base=base))
+    tasks = [simulation.foregrounds(Graph(with_engine(plugged, engine))) for engine in ("dense", "without_first.py")]
+    products = make(tasks, plugged.folder)
+    expected, found = (to_cube(read_visibilities(products[task.key].path / "visibilities.uvh5")) for task in tasks)
+    assert not found[:, 0].any()
+    # Both to the tolerance of the interpolation.
+    np.testing.assert_allclose(found[:, 1:], expected[:, 1:], rtol=0, atol=1e-6 * abs(expected).max())

@@ -83,3 +83,24 @@ def test_all_spectra_of_a_run_are_made_with_it(plugged):
     kept = sum(frequency >= 171e6 for frequency in 170e6 + 80e3 * np.arange(CHANNELS))
     assert found.power.shape == (21, kept)
     assert cylindrical_average(found, experiment.power).power.shape[1] == kept // 2 + 1
+
+
+TWICE = """
+from dataclasses import replace
+from calstudy.power.estimators.hera_pspec import HeraPspec
+
+class Twice(HeraPspec):
+    def estimate(self, even, odd, beam, settings):
+        found = super().estimate(even, odd, beam, settings)
+        return replace(found, power=2 * found.power, share_power=2 * found.share_power)
+"""
+
+
+@pytest.mark.chain
+def test_one_that_changes_the_default_is_used_with_a_folder_as_well(plugged):
+    (plugged.folder / "twice.py").write_text(TWICE)
+    graphs = [Graph(with_estimator(plugged, each)) for each in ("hera-pspec", "twice.py")]
+    tasks = [spectra.variant_power(graph, "noise", Variant(components=("noise",))) for graph in graphs]
+    products = make(tasks, plugged.folder)
+    default, own = (spectra.read_delay_spectra(products[task.key].path) for task in tasks)
+    np.testing.assert_allclose(own.power, 2 * default.power, rtol=1e-12)

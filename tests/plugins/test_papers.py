@@ -20,6 +20,7 @@ from calstudy.base.errors import InputError
 from calstudy.base.user_code import load_file
 from calstudy.claims.evaluation import evaluate_folder
 from calstudy.experiment.files import override, validate
+from calstudy.experiment.model import PAPERS
 from calstudy.papers.barry2016 import Barry2016
 from calstudy.regression import accept, read_reference
 from calstudy.report.page import read_contents
@@ -170,3 +171,26 @@ def test_members_of_a_collection_play_its_roles(folder):
     assert verdicts(run.folder) == VERDICTS
     assert evaluate_folder(run.folder).verdicts == from_json((run.folder / "claims.json").read_text())
     assert json.loads((run.folder / "manifest.json").read_text())["roles"] == {"hexagon": "tiny"}
+
+
+def test_papers_of_modules_with_one_name_keep_their_own_statements(tmp_path):
+    code = """
+from types import SimpleNamespace
+from calstudy.claims.paper import Paper
+from calstudy.verdicts.statement import Statement
+
+class Base(Paper):
+    kind: str = ""
+
+class Said(Statement):
+    name: str = NAME
+
+SAID = Said.__new__(Said)
+"""
+    found = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "common.py").write_text(code.replace("NAME", repr(name)))
+        (tmp_path / name / "p.py").write_text("from common import Base\n\n\nclass P(Base):\n    kind: str = ''\n")
+        found.append(PAPERS.make(str(tmp_path / name / "p.py")))
+    assert [[item.name for item in paper.statements()] for paper in found] == [["a"], ["b"]]

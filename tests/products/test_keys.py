@@ -337,3 +337,27 @@ def test_a_plan_counts_the_blocks_of_averages_differences_and_spectra():
     whole, halves = found
     assert halves[:2] == (2 * whole[0], 2 * whole[1])
     assert halves[2] > whole[2]
+
+
+def test_a_product_of_a_module_beside_a_file_counts_with_its_content(tmp_path):
+    (tmp_path / "table.py").write_text("from beside import Answer\n\n\ndef made():\n    return Answer('')\n")
+    keys = []
+    for number in (42, 43):
+        (tmp_path / "beside.py").write_text(
+            "from calstudy.run.task import Task\n\n\nclass Answer(Task, stage='answer'):\n"
+            f"    def make(self, output):\n        return {{'answer': {number}}}\n"
+        )
+        keys.append(load_file(tmp_path / "table.py").made().key)
+    assert keys[0] != keys[1]
+
+
+def test_a_file_that_an_option_of_a_sky_names_counts_by_its_content(tmp_path):
+    (tmp_path / "sky.py").write_text("def sky(frequencies, data, names):\n    return None\n")
+    options = {"data": {"flux": str(tmp_path / "flux.txt")}, "names": ["no such file", 3]}
+    foregrounds = {"kind": "code", "path": "sky.py", "function": "sky", "options": options}
+    found = []
+    for text in ("10", "99"):
+        (tmp_path / "flux.txt").write_text(text)
+        found.append(identity(validate(override(tiny(tmp_path), "sky.foregrounds", foregrounds), tmp_path).sky))
+    assert found[0] != found[1]
+    assert found[0]["foregrounds"]["options"]["names"] == ["no such file", 3]

@@ -230,11 +230,11 @@ def test_the_summary_of_a_sweep_is_shown_with_a_row_per_point(tmp_path):
 
 def test_what_the_run_wrote_and_is_gone_is_said(folder):
     products = [
-        {"stage": "comparison", "files": {"comparison.json": ""}},
         {"stage": "figure", "label": "wedge"},
         {"stage": "figure", "label": "gains"},
     ]
     content = json.loads((folder / "manifest.json").read_text())
+    content["tables"] = ["comparison.json"]
     content["products"] = [{**content["products"][0], "label": "", **new} for new in products]
     (folder / "manifest.json").write_text(json.dumps(content))
     said = "missing, and written by the run: comparison.json, gains.png; run it again"

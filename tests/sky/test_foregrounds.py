@@ -10,7 +10,7 @@ import pytest
 import requests
 from astropy import units
 from astropy.coordinates import SkyCoord
-from astropy.io.votable import from_table
+from astropy.io.votable import from_table, parse
 from astropy.table import Table
 from pydantic import ValidationError
 from pyradiosky import SkyModel
@@ -406,6 +406,40 @@ def test_any_votable_is_read_by_the_columns_named(tmp_path):
     sky = make_foregrounds(votable_of_two(tmp_path / "mine.vot", 2), FREQUENCIES).sky
     assert flux(sky) == pytest.approx([2.0, 1.0])
     assert sky.skycoord.icrs.ra.deg == pytest.approx([10.0, 20.0])
+
+
+@pytest.mark.parametrize(("column", "values"), [("s", [9999.0, 1.0]), ("ra", [9999.0, 20.0])])
+def test_the_null_value_of_a_votable_is_no_number(tmp_path, column, values):
+    settings = votable_of_two(tmp_path / "mine.vot", 2)
+    found = parse(str(settings.path))
+    field = found.get_first_table().get_field_by_id_or_name(column)
+    found.get_first_table().array[column] = values
+    field.values.null = 9999.0
+    found.to_xml(str(settings.path))
+    with pytest.raises(InputError, match=rf"1 entries of column {column} have its null value, 9999\.0; leave out"):
+        make_foregrounds(settings, FREQUENCIES)
+
+
+def test_a_source_without_a_position_is_left_out(tmp_path):
+    settings = votable_of_two(tmp_path / "mine.vot", 2)
+    found = parse(str(settings.path))
+    found.get_first_table().array["ra"] = [np.nan, 20.0]
+    found.to_xml(str(settings.path))
+    foregrounds = make_foregrounds(settings, FREQUENCIES)
+    assert flux(foregrounds.sky) == pytest.approx([1.0])
+    assert foregrounds.stand_in == "foregrounds: 1 sources of mine.vot"
+
+
+def test_a_sky_that_another_process_draws_otherwise_is_refused(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "import numpy as np\nfrom astropy import units\nfrom astropy.coordinates import SkyCoord\n"
+        "from pyradiosky import SkyModel\n\nRA = np.random.default_rng().uniform(0, 10)\n\n\n"
+        "def sky(frequencies):\n    return SkyModel(name=['a'], skycoord=SkyCoord([RA], [-30], unit='deg'),\n"
+        "                    stokes=np.array([1.0, 0, 0, 0])[:, None, None] * units.Jy, spectral_type='flat')\n"
+    )
+    with pytest.raises(InputError, match="returns another sky at every call; draw it with a fixed seed"):
+        make_foregrounds(section.CodeSources(kind="code", path=path, function="sky"), FREQUENCIES)
 
 
 CSV = {"right_ascension": "ra", "declination": "dec", "flux": "s", "frequency": "150 MHz"}

@@ -120,17 +120,6 @@ def test_free_memory_is_the_default(paper, monkeypatch):
     assert fit(paper, None, None)[1] == 5
 
 
-def test_a_worker_is_started_for_each_minute_of_work(paper, tmp_path, monkeypatch):
-    """One takes 10 s of processor time to load the libraries: in a small run, more than it saves."""
-    monkeypatch.setattr(execution, "free_memory", lambda: 200e9)
-    monkeypatch.setattr(capacity, "cores", lambda: 5)
-    assert fit(paper, None, None, targets=lambda experiment: [corruption.gains(Graph(experiment))])[1] == 1
-    small = load(EXPERIMENTS / "quickstart.yaml", None, [f"outputs.store={tmp_path / 'store'}"])
-    seconds = sum(task.cost.seconds for task in tasks_of(small))
-    assert fit(small, None, None)[1] == 1 + seconds // 60 < 5
-    assert fit(small, 5, None)[1] == 5
-
-
 def test_workers_asked_for_without_a_limit_are_given(paper, monkeypatch):
     monkeypatch.setattr(execution, "free_memory", lambda: 6e9)
     assert fit(paper, 16, None)[1] == 16

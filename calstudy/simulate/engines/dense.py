@@ -48,7 +48,8 @@ class DenseEngine(Engine):
 
     def simulate(self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData) -> np.ndarray:
         """Return the visibilities in Jy, (Ntimes, Nbls, Nfreqs, Npols) complex128; see `Engine.simulate`."""
-        return self.interpolate(sky, beam, template, EXACT)
+        # That of a subclass may call this.
+        return DenseEngine.interpolate(self, sky, beam, template, EXACT)
 
     def interpolate(
         self, sky: SkyModel, beam: AntennaBeam | AntennaBeams, template: UVData, accuracy: Accuracy
