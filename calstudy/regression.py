@@ -20,6 +20,7 @@ from calstudy.experiment.files import dump_yaml
 from calstudy.experiment.model import FIGURES
 from calstudy.results.reader import EXPERIMENT, MANIFEST, NO_RUN, RunFolder
 from calstudy.run.execution import Budget
+from calstudy.studies.folder import manifest_text
 from calstudy.studies.load import load_study
 from calstudy.studies.study import run_study
 from calstudy.verdicts.criterion import Verdict
@@ -103,6 +104,7 @@ def accept(run: Path, reference: Path) -> None:
     """Make a finished run the reference: its pictures, arrays, tables, claims and description replace the old ones.
 
     A collection keeps the experiments of its members as they are in the references beside it, by the members' names.
+    The manifest does not list tables, since a reference has but some.
     Raise InputError if the run is not readable, or the folder, which need not exist, cannot be written; the complete
     run is read before anything is written.
     """
@@ -115,18 +117,19 @@ def accept(run: Path, reference: Path) -> None:
         listed = {name for entry in manifest.get("products", []) for name in entry.get("files", ())}
         paths |= {f"tables/{name}": run / "tables" / name for name in sorted(listed)}
         contents = {name: path.read_bytes() for name, path in paths.items()}
-        contents[MANIFEST] = (run / MANIFEST).read_bytes()
+        kept = {"products": [], **manifest}
+        kept.pop("tables", None)
         if "members" in manifest:
-            beside = {**manifest, "members": {name: name for name in manifest["members"]}}
-            contents[MANIFEST] = json.dumps(beside, indent=1).encode()
+            kept["members"] = {name: name for name in manifest["members"]}
+        contents[MANIFEST] = manifest_text(kept).encode()
         description = dump_yaml(_experiment(run))
     except (OSError, ValueError) as error:
         raise InputError(f"{run}: cannot be read ({error})") from None
     with errors_of_files(f"{reference}: cannot be written"):
         (reference / "tables").mkdir(parents=True, exist_ok=True)
-        kept = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
-        kept += [*(reference / name for name in (*CLAIMS_FILES, *TABLES)), *(reference / "tables").iterdir()]
-        for old in kept:
+        present = [path for ending in KEPT for path in reference.glob(f"*.{ending}")]
+        present += [*(reference / name for name in (*CLAIMS_FILES, *TABLES)), *(reference / "tables").iterdir()]
+        for old in present:
             if old.relative_to(reference).as_posix() not in contents:
                 old.unlink(missing_ok=True)
         for name, content in (*contents.items(), (EXPERIMENT, description.encode())):

@@ -39,13 +39,14 @@ def _identity_of_folder(folder: Path) -> dict[str, str]:
 
 
 def _with_files(value: Any) -> Any:
-    """Return a block with paths in place of texts that name existing files."""
+    """Return a block with paths in place of texts that are absolute paths of existing files."""
     if isinstance(value, Mapping):
         return {name: _with_files(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [_with_files(item) for item in value]
     # Of a name that is too long, Path.is_file raises OSError.
-    return Path(value) if isinstance(value, str) and os.path.isfile(value) else value  # noqa: PTH113
+    named = isinstance(value, str) and Path(value).is_absolute() and os.path.isfile(value)  # noqa: PTH113
+    return Path(value) if named else value
 
 
 def _identity_of_section(section: BaseModel) -> dict[str, Any]:

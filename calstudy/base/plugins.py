@@ -33,10 +33,10 @@ FILE_REFERENCE = re.compile(r"(?P<path>.+\.py)(?::(?P<name>[A-Za-z_][A-Za-z0-9_]
 class Plugin(Section):
     """The base class of all plug-ins. Subclasses declare settings as fields, and behaviour as methods.
 
-    The base class of each kind sets the `registry`, and `inherited_with`: each method of its keys is inherited only
-    together with the method of the value, which it may bypass; otherwise that of the base class is used, which calls
-    it. The version of a built-in plug-in is increased whenever its results change, so that the products that depend on
-    it are made again.
+    The base class of each kind sets the `registry`, and `inherited_with`: a built-in method of its keys may bypass the
+    method of the value. A class that overrides the latter does not inherit it, but that of the base class, which calls
+    the latter. The version of a built-in plug-in is increased whenever its results change, so that the products that
+    depend on it are made again.
     """
 
     registry: ClassVar[Registry]
@@ -48,8 +48,15 @@ class Plugin(Section):
         """Replace methods that would bypass one that the class overrides."""
         super().__pydantic_init_subclass__(**given)
         for name, other in cls.inherited_with.items():
-            if other in vars(cls) and name not in vars(cls):
+            after = cls.__mro__[cls.__mro__.index(cls._provider(other)) + 1 :]
+            bypassing = cls._provider(name)
+            if bypassing in after and bypassing.__module__.startswith(f"{cls.registry.package}."):
                 setattr(cls, name, getattr(cls.registry.base, name))
+
+    @classmethod
+    def _provider(cls, name: str) -> type:
+        """Return the class whose method of this name is used."""
+        return next(kind for kind in cls.__mro__ if name in vars(kind))
 
     @property
     def reference(self) -> str:

@@ -46,7 +46,11 @@ def _of_files(schema: Any) -> Any:
         return [_of_files(part) for part in schema]
     if not isinstance(schema, dict):
         return schema
-    relaxed = {"strict": False} if schema.get("type") in NOT_IN_FILES else {}
+    kind = schema.get("type")
+    if not isinstance(kind, str):
+        # A table of fields, which may have any name.
+        return {name: _of_files(part) for name, part in schema.items()}
+    relaxed = {"strict": False} if kind in NOT_IN_FILES else {}
     kept = ("default", "metadata", "serialization")
     return relaxed | {name: part if name in kept else _of_files(part) for name, part in schema.items()}
 

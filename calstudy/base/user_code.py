@@ -19,7 +19,7 @@ from threading import Lock, current_thread, main_thread
 from types import CodeType, ModuleType
 from typing import Any
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, refusal_of_disk
 from calstudy.base.files import kept_while_unchanged, sha256
 
 FILE_MODULE = "calstudy_plugin_"
@@ -118,15 +118,15 @@ def _imported(path: Path, package: str = "", in_functions: bool = False) -> Iter
             yield from (".".join(parts[: count + 1]) for count in range(len(parts)))
 
 
-def load_file(path: Path, anew: bool = False) -> ModuleType:
-    """Run a Python file as a module, once for each version of its content, or `anew`, and return the module.
+def load_file(path: Path) -> ModuleType:
+    """Run a Python file as a module, once for each version of its content, and return the module.
 
     It can import modules of its folder, which are then run again. Raises InputError if the file cannot be read or is
     not valid Python, if running it raises an error (the message names the line), or if code of files is refused.
     """
     content, beside = _read_code(path)
     name = f"{FILE_MODULE}{path.stem}_{hashlib.sha256(f'{path}{content}'.encode()).hexdigest()[:12]}"
-    if name in sys.modules and not anew:
+    if name in sys.modules:
         return sys.modules[name]
     loader = _Uncompiled(name, str(path.absolute()))
     spec = importlib.util.spec_from_file_location(name, path, loader=loader)
@@ -241,12 +241,9 @@ def _is_of_file(space: Mapping[str, Any]) -> bool:
     return isinstance(getattr(space.get("__spec__"), "loader", None), _Uncompiled)
 
 
-def load_function(path: Path, name: str, anew: bool = False) -> Callable[..., Any]:
-    """Return a function that a Python file defines; raises InputError if it does not, or cannot be run.
-
-    With `anew` the file is run again, as another process would.
-    """
-    module = load_file(path, anew)
+def load_function(path: Path, name: str) -> Callable[..., Any]:
+    """Return a function that a Python file defines; raises InputError if it does not, or cannot be run."""
+    module = load_file(path)
     functions = {
         key: value
         for key, value in vars(module).items()
@@ -269,7 +266,7 @@ def user_code(name: str = "") -> Iterator[None]:
     `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
     defects of calstudy, except where the call itself does not fit the user's function. KeyboardInterrupt passes in the
     main thread, where it is Ctrl-C. Without a `name` the code may be anybody's: lines are then those of plug-ins in
-    files alone.
+    files alone, and what the file system refuses passes.
     """
     try:
         yield
@@ -277,6 +274,8 @@ def user_code(name: str = "") -> Iterator[None]:
         raise
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
+            raise
+        if not name and isinstance(error, OSError | RuntimeError) and refusal_of_disk(error):
             raise
         frames = [
             (frame.f_code, line)

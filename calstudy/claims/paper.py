@@ -34,7 +34,7 @@ class Paper(Plugin):
     roles: ClassVar[Mapping[str, str]] = {}
     usual_members: ClassVar[Mapping[str, str]] = {}
     own_solver_roles: ClassVar[Mapping[str, str]] = {}
-    module: ClassVar[ModuleType]
+    module: ClassVar[ModuleType | None]
 
     kind: str
 
@@ -42,12 +42,14 @@ class Paper(Plugin):
     def __pydantic_init_subclass__(cls, **given: Any) -> None:
         """Keep the module of a class: another file may import another module of this name later."""
         super().__pydantic_init_subclass__(**given)
-        cls.module = sys.modules[cls.__module__]
+        cls.module = sys.modules.get(cls.__module__)
 
     def statements(self) -> Sequence[Statement]:
         """Return the statements, in the order of the paper; by default those in the module of the class or a base."""
         modules = [vars(kind)["module"] for kind in type(self).__mro__ if "module" in vars(kind)]
-        found = ([item for item in vars(module).values() if isinstance(item, Statement)] for module in modules)
+        found = (
+            [item for item in vars(module).values() if isinstance(item, Statement)] for module in filter(None, modules)
+        )
         return next(filter(None, found), [])
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:

@@ -358,9 +358,14 @@ class RunFolder:
 
     @property
     def lost(self) -> list[str]:
-        """Names of the tables and figures that the run wrote, by its manifest, and that are not in its folder."""
+        """Names of the tables and figures that the run wrote, by its manifest, and that are not in its folder.
+
+        Empty for references, which keep a part of them, and for runs of earlier versions: they do not list tables.
+        """
+        if "tables" not in self.manifest:
+            return []
         drawn = [f"{entry['label']}.png" for entry in self.products if entry.get("stage") == "figure"]
-        places = {self.path / "tables": self.manifest.get("tables", ()), self.figures: drawn}
+        places = {self.path / "tables": self.manifest["tables"], self.figures: drawn}
         return [name for folder, names in places.items() for name in names if not (folder / name).is_file()]
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -329,9 +330,8 @@ def _require_in_band(sky: SkyModel, frequencies: np.ndarray, path: Path) -> None
 def _from_code(settings: section.CodeSources, frequencies: np.ndarray) -> Foregrounds:
     where = f"{settings.function} of {settings.path.name}"
     with user_code(where):
-        # The second one as in another process, which runs the file again.
-        functions = [load_function(settings.path, settings.function, anew) for anew in (False, True)]
-        sky, again = (function(frequencies.copy(), **settings.options) for function in functions)
+        function = load_function(settings.path, settings.function)
+        sky, again = (function(frequencies.copy(), **settings.options) for _ in range(2))
     if not isinstance(sky, SkyModel) or sky.component_type != "point":
         raise InputError(f"sky.foregrounds: {where} must return a pyradiosky SkyModel of points")
     if sky != again:
@@ -385,21 +385,27 @@ def _require_idl(path: Path) -> None:
             raise ValueError("not an IDL save file")
 
 
-def _require_no_nulls(path: Path) -> None:
-    """Raise ValueError if entries of a VOTable have the null value of their column, which pyradiosky takes for data."""
+def _require_no_nulls(path: Path, columns: section.VotableColumns) -> None:
+    """Raise ValueError if positions or fluxes have the null value of their column, which pyradiosky takes for data."""
     with path.open("rb") as stream:
         if not re.search(rb"<VALUES[^>]*\bnull=", stream.read(LONGEST_HEADER)):
             return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        tables = [found.to_table() for found in votable.parse(str(path)).iter_tables()]
-    for name, column in ((name, found[name]) for found in tables for name in found.colnames):
-        values = np.ma.getdata(column)
-        if column.dtype.kind in "iuf" and (null := np.ma.getmaskarray(column) & np.isfinite(values)).any():
-            raise ValueError(
-                f"{null.sum()} entries of column {name} have its null value, {values[null][0]}; leave out their "
-                "rows, or leave these cells empty"
-            )
+        tables = {str(found.ID or found.name): found.to_table() for found in votable.parse(str(path)).iter_tables()}
+    used = (columns.right_ascension, columns.declination, columns.flux, columns.spectral_index)
+    for found in (tables[name] for name in _matching(columns.table, tables)):
+        for name in (name for part in used if part is not None for name in _matching(part, found.colnames)):
+            values = np.ma.getdata(found[name])
+            if values.dtype.kind in "iuf" and (null := np.ma.getmaskarray(found[name]) & np.isfinite(values)).any():
+                has = f"{null.sum()} entries of column {name} have its null value, {values[null][0]}"
+                raise ValueError(f"{has}; leave out their rows")
+
+
+def _matching(part: str, names: Iterable[str]) -> list[str]:
+    """Return the names that are equal to a part, or else contain it; case does not count, as in pyradiosky."""
+    found = [name for name in names if part.casefold() in name.casefold()]
+    return [name for name in found if name.casefold() == part.casefold()] or found
 
 
 def _read_votable(path: Path, columns: section.VotableColumns) -> SkyModel:
@@ -437,8 +443,9 @@ def _read(settings: section.FileSources) -> SkyModel:
                 warnings.filterwarnings("ignore", message="Source IDs are not unique")
                 return SkyModel.from_fhd_catalog(str(path), expand_extended=False)
         if settings.votable is not None:
-            _require_no_nulls(path)
-            return _in_jansky(_read_votable(path, settings.votable))
+            sky = _in_jansky(_read_votable(path, settings.votable))
+            _require_no_nulls(path, settings.votable)
+            return sky
         if settings.csv is not None:
             return read_csv_catalogue(path, settings.csv)
         _require_known_units(path)

@@ -118,11 +118,16 @@ def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
         "other_code": other_code([entry["stage"] for entry in fields["products"] if "made_with" in entry]),
         **fields,
     }
-    # A line for each product: comparisons have more than a thousand.
-    lines = ",\n  ".join(json.dumps(entry) for entry in manifest.pop("products"))
-    text = json.dumps(manifest, indent=1).removesuffix("\n}")
-    write(folder / MANIFEST, f'{text},\n "products": [\n  {lines}\n ]\n}}')
+    write(folder / MANIFEST, manifest_text(manifest))
     _remove_leftovers(folder)
+
+
+def manifest_text(manifest: Mapping[str, Any]) -> str:
+    """Return a manifest as JSON, with a line for each product: comparisons have more than a thousand."""
+    lines = ",\n  ".join(json.dumps(entry) for entry in manifest["products"])
+    others = {name: value for name, value in manifest.items() if name != "products"}
+    text = json.dumps(others, indent=1).removesuffix("\n}")
+    return f'{text},\n "products": [\n  {lines}\n ]\n}}'
 
 
 RECORDED = ("label", "key", "notes", "seconds", "cpu_seconds", "peak_memory_bytes", "started", "inputs", "lineage")

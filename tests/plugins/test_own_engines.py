@@ -7,11 +7,16 @@ import pytest
 from plugin_files import Plugged, make
 
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.user_code import load_file
 from calstudy.base.visibilities import to_cube
 from calstudy.products import simulation
 from calstudy.products.files import read_visibilities
 from calstudy.products.graph import Graph
+from calstudy.simulate.engines.dense import DenseEngine
+from calstudy.simulate.interface import Engine
 from calstudy.studies.reference import field_reference, plugin_reference
+
+SIMULATE = "    def simulate(self, sky, beam, template):\n        return 0\n"
 
 
 @pytest.fixture(params=["path", "entry point"])
@@ -54,6 +59,22 @@ def test_its_visibilities_are_those_of_the_default(plugged):
     expected, found = (to_cube(read_visibilities(products[task.key].path / "visibilities.uvh5")) for task in tasks)
     # Two ways to add up the same terms: what differs is rounding, of phases of up to 1e3 turns.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("bases", "own", "expected"),
+    [("Mixin, DenseEngine", "", "Engine"), ("Own", SIMULATE, "Own"), ("DenseEngine", "", "DenseEngine")],
+)
+def test_the_interpolation_that_calls_the_simulation_is_used(tmp_path, bases, own, expected):
+    """Of a class that overrides one of them; an interpolation of the user's is nobody's to replace."""
+    (tmp_path / "derived.py").write_text(
+        f"from calstudy.simulate.engines.dense import DenseEngine\n\n\nclass Mixin:\n{SIMULATE}\n\n"
+        "class Own(DenseEngine):\n    kind: str = ''\n\n    def interpolate(self, *given):\n        return 1\n\n\n"
+        f"class Derived({bases}):\n    kind: str = ''\n\n{own}"
+    )
+    module = load_file(tmp_path / "derived.py")
+    known = {"Engine": Engine, "DenseEngine": DenseEngine, "Own": module.Own}
+    assert module.Derived.interpolate is known[expected].interpolate
 
 
 def test_it_refuses_in_a_sentence(plugged):

@@ -115,13 +115,16 @@ def test_lists_and_texts_of_a_file_become_tuples_sets_and_paths(tmp_path):
     (tmp_path / "typed.py").write_text(
         "from pathlib import Path\nfrom calstudy.corrupt.interface import Effect\n\n\nclass Typed(Effect):\n"
         "    table: Path\n    limits: tuple[float, ...] | None = None\n    pairs: dict[str, tuple[int, int]] = {}\n"
-        "    chosen: frozenset[int] = frozenset()\n\n    def apply(self, visibilities, observation, truth):\n"
+        "    chosen: frozenset[int] = frozenset()\n    metadata: tuple[int, ...] = ()\n"
+        "    default: tuple[tuple[int, ...], ...] = ()\n\n    def apply(self, visibilities, observation, truth):\n"
         "        return visibilities\n"
     )
     block = {"kind": "typed.py", "table": "table.txt", "limits": [1, 2.5], "pairs": {"a": [0, 1]}, "chosen": [3, 3]}
+    block |= {"metadata": [1, 2], "default": [[1, 2]]}
     made = Effect.registry.make(block, folder=tmp_path)
     assert (made.table, made.limits) == (tmp_path / "table.txt", (1.0, 2.5))
     assert (made.pairs, made.chosen) == ({"a": (0, 1)}, {3})
+    assert (made.metadata, made.default) == ((1, 2), ((1, 2),))
     assert loads(dumps(made)) == made
     for wrong in ({"limits": ["1"]}, {"pairs": {"a": [0, "1"]}}, {"limits": 3}, {"table": 3}):
         with pytest.raises(ValidationError):

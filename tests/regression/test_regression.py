@@ -94,6 +94,8 @@ def test_a_reference_keeps_the_tables_that_the_manifest_has_on_record(reference,
     other, run = tmp_path / "reference", tmp_path / "run"
     shutil.copytree(reference, other)
     shutil.copytree(finished, run)
+    # Of the others, which it does not keep, none is missing.
+    assert (RunFolder(finished).lost, RunFolder(reference).lost) == ([], [])
     # All of a run is read before anything of a reference is replaced.
     (run / "tables" / "residual.outside-wedge.h5").unlink()
     with pytest.raises(InputError, match=r"run: cannot be read .*residual\.outside-wedge\.h5"):

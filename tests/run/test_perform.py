@@ -16,7 +16,7 @@ from number_task import Number, run
 
 from calstudy.base.errors import DiskError, ExperimentError, InputError
 from calstudy.base.resources import Cost
-from calstudy.base.user_code import UserCodeError
+from calstudy.base.user_code import UserCodeError, load_file
 from calstudy.run import execution
 from calstudy.run.execution import Lifetimes, WorkOrder, largest_disk, perform, schedule
 from calstudy.run.store import Lease, Store, products
@@ -516,3 +516,14 @@ def test_only_files_of_the_store_are_taken_for_it(store, number, tmp_path):
     with pytest.raises(OSError, match="no") as caught:
         perform(WorkOrder.of(failing(outside, "outside"), store))
     assert caught.value is outside
+
+
+def test_a_full_disk_is_one_for_products_of_users_files_as_well(store, tmp_path):
+    (tmp_path / "own.py").write_text(
+        "import errno\nfrom calstudy.run.task import Task\n\n\nclass Own(Task, stage='own'):\n"
+        "    def make(self, output):\n        raise OSError(errno.ENOSPC, 'full', str(output / 'file'))\n"
+    )
+    with pytest.raises(
+        DiskError, match=r"outputs\.store = .*: own \(\) could not be written \(No space left on device\)"
+    ):
+        perform(WorkOrder.of(load_file(tmp_path / "own.py").Own(""), store))

@@ -420,6 +420,17 @@ def test_the_null_value_of_a_votable_is_no_number(tmp_path, column, values):
         make_foregrounds(settings, FREQUENCIES)
 
 
+def test_null_values_of_columns_that_are_not_read_do_not_matter(tmp_path):
+    settings = votable_of_two(tmp_path / "mine.vot", 2)
+    table = Table.read(settings.path)
+    table["e_s"] = [-999, 1]
+    found = from_table(table)
+    found.resources[0].tables[0].name = "survey"
+    found.get_first_table().get_field_by_id_or_name("e_s").values.null = -999
+    found.to_xml(str(settings.path))
+    assert flux(make_foregrounds(settings, FREQUENCIES).sky) == pytest.approx([2.0, 1.0])
+
+
 def test_a_source_without_a_position_is_left_out(tmp_path):
     settings = votable_of_two(tmp_path / "mine.vot", 2)
     found = parse(str(settings.path))
@@ -428,18 +439,6 @@ def test_a_source_without_a_position_is_left_out(tmp_path):
     foregrounds = make_foregrounds(settings, FREQUENCIES)
     assert flux(foregrounds.sky) == pytest.approx([1.0])
     assert foregrounds.stand_in == "foregrounds: 1 sources of mine.vot"
-
-
-def test_a_sky_that_another_process_draws_otherwise_is_refused(tmp_path):
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "import numpy as np\nfrom astropy import units\nfrom astropy.coordinates import SkyCoord\n"
-        "from pyradiosky import SkyModel\n\nRA = np.random.default_rng().uniform(0, 10)\n\n\n"
-        "def sky(frequencies):\n    return SkyModel(name=['a'], skycoord=SkyCoord([RA], [-30], unit='deg'),\n"
-        "                    stokes=np.array([1.0, 0, 0, 0])[:, None, None] * units.Jy, spectral_type='flat')\n"
-    )
-    with pytest.raises(InputError, match="returns another sky at every call; draw it with a fixed seed"):
-        make_foregrounds(section.CodeSources(kind="code", path=path, function="sky"), FREQUENCIES)
 
 
 CSV = {"right_ascension": "ra", "declination": "dec", "flux": "s", "frequency": "150 MHz"}
