@@ -555,9 +555,14 @@ class OpenRun:
         for store in stores:
             if (product := store.find(task.stage.name, key)) is not None:
                 return product.path
+        missing = f"{task.stage.name} ({task.label}): is not in the store {stores[-1].root}"
+        if not keys:
+            raise InputError(
+                f"{missing}, since nothing in this run needed it; add a figure or table that does, and run"
+            )
         raise InputError(
-            f"{task.stage.name} ({task.label}): is not in the store {stores[-1].root}, or was made by another version; "
-            "start Python in the folder in which the study was run, or run it again"
+            f"{missing}, or was made by another version; start Python in the folder in which the study was run, or run "
+            "it again"
         )
 
     def _stores(self, outputs: Folders) -> list[Store]:

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from calstudy.base.errors import InputError, errors_of_files
-from calstudy.base.files import replacing
+from calstudy.base.files import replacing, write_text
 from calstudy.base.table import Table
 from calstudy.experiment.files import dump_yaml
 from calstudy.experiment.model import FIGURES
@@ -392,7 +392,7 @@ def write_json(regression: Regression, folder: Path) -> Path:
     path = folder / REGRESSION_JSON
     text = json.dumps({**asdict(regression), "holds": regression.holds}, indent=1, ensure_ascii=False)
     with errors_of_files(f"{path}: cannot be written"):
-        path.write_text(text + "\n", encoding="utf-8")
+        write_text(path, text + "\n")
     return path
 
 

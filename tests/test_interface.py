@@ -1,5 +1,7 @@
 """The Python interface returns what the files of a run hold, with labels and units."""
 
+import errno
+import json
 import re
 import shutil
 import subprocess
@@ -214,6 +216,13 @@ def test_gains_and_visibilities_are_those_of_pyuvdata(run):
         run.gains("eor")
 
 
+def test_the_error_of_a_difference_from_the_eor_has_no_sample_variance(run):
+    spectrum = run.spectra["residual"]
+    assert spectrum.difference_error.attrs["units"] == spectrum.noise_error.attrs["units"]
+    assert (spectrum.noise_error <= spectrum.difference_error).all()
+    assert (spectrum.difference_error < spectrum.noise_error + spectrum.sample_error).all()
+
+
 def test_errors_of_gains_are_computed_from_the_products(run):
     gains, errors = run.gains("residual"), run.gain_errors("residual")
     assert errors.amplitude.dims == ("antenna", "frequency", "time", "feed")
@@ -243,6 +252,41 @@ def test_the_store_is_found_from_any_working_directory(file, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     assert found.gains("true").Nants_data > 1
     assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (FileNotFoundError(errno.ENOENT, "no", "store/figure/x"), "store/figure/x: was removed while the results were"),
+        (OSError(errno.ENOSPC, "No space left on device"), r"outputs\.runs = .* cannot be written \(No space left on"),
+    ],
+)
+def test_results_that_cannot_be_written_are_told_in_a_sentence(run, file, monkeypatch, error, told):
+    def refuse(*_):
+        raise error
+
+    monkeypatch.setattr("calstudy.studies.study.publish", refuse)
+    with pytest.raises(InputError, match=told):
+        calstudy.load(file).run(workers=1, quiet=True)
+
+
+def test_a_product_that_a_run_did_not_need_is_named_as_such(run, tmp_path):
+    shutil.copytree(run.folder, tmp_path / "run")
+    path = tmp_path / "run" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for entry in manifest["products"]:
+        entry["key"] = "0" * 32
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"gains \(true gains\): .*, or was made by another version; start Python in"):
+        calstudy.open_run(tmp_path / "run").gains("true")
+    content = yaml.safe_load((tmp_path / "run" / "experiment.yaml").read_text())
+    content["sky"]["eor"]["seed"] = content["corruption"]["effects"][0]["seed"] = 991
+    (tmp_path / "run" / "experiment.yaml").write_text(yaml.safe_dump(content))
+    path.write_text(json.dumps({**manifest, "products": []}))
+    with pytest.raises(
+        InputError, match=r"gains \(true gains\): is not in the store .*, since nothing in this run needed"
+    ):
+        calstudy.open_run(tmp_path / "run").gains("true")
 
 
 def test_workers_that_cannot_start_say_what_a_script_must_have(file, monkeypatch):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -68,6 +70,22 @@ def test_a_new_experiment_names_a_schema_of_its_folder_by_a_relative_path(here, 
     monkeypatch.chdir(here / folder)
     output_of(capsys, "init", "mine")
     assert Path("mine.yaml").read_text().splitlines()[0] == f"# yaml-language-server: $schema={named}{SCHEMA_FILE}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"), [(["init", "mine"], "mine.yaml"), (["fields", "--schema", "s.json"], "s.json")]
+)
+def test_a_file_that_cannot_be_written_in_full_is_not_there(here, capsys, monkeypatch, arguments, name):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        status, message = run_command(capsys, *arguments)
+    assert (status, list(here.iterdir())) == (REFUSED, [])
+    assert f"{name}: cannot be written (No space left on device)" in message
+    output_of(capsys, *arguments)
+    assert (here / name).is_file()
 
 
 def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
@@ -319,8 +337,12 @@ def test_no_file_is_written_about_one_integration(here, capsys):
 
 def test_a_file_about_measured_data_is_valid_and_proposes_what_is_quiet_and_alive(here, capsys, schema):
     package = "hera_qm:data/zen.2457698.40355.xx.HH.uvh5"
-    output_of(capsys, "init", "mine", "--data", package)
+    told = output_of(capsys, "init", "mine", "--data", package)
     text = (here / "mine.yaml").read_text()
+    assert "observed.beam = hera is a guess, which sets the level of power spectra" in told
+    assert re.search(r"  beam: hera +# a guess", text)
+    assert "a guess" not in output_of(capsys, "init", "named", "--data", package, "--beam", "hera")
+    assert "a guess" not in (here / "named.yaml").read_text()
     content = parse_yaml(text, "mine")
     assert [error.message for error in schema.iter_errors(content)] == []
     # There is interference at 149.902 and 157.812 MHz, and antenna 81 saw no sky.

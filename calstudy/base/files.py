@@ -72,3 +72,9 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         partial_file.replace(path)
     finally:
         partial_file.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file completely or not at all."""
+    with replacing(path) as stream:
+        stream.write(text.encode())

@@ -375,11 +375,12 @@ def _of_jones(jones: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.where(known, 1 / np.where(known, diagonal, 1).conj(), np.nan), 0, 2)
 
 
-def write_gains(cal: UVCal, path: Path) -> None:
+def write_gains(cal: UVCal, path: Path | str) -> None:
     """Write gains by channel, of all antennas by number, in the format of a suffix in `WRITERS`.
 
     Raises InputError for another suffix, and if a format of Jones matrices lacks a feed.
     """
+    path = Path(path)
     if path.suffix not in WRITERS:
         raise InputError(f"{path}: gains are not written as {path.suffix!r}; allowed are {', '.join(WRITERS)}")
     WRITERS[path.suffix](GainTable.of(cal), path)

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError
+from calstudy.base.files import write_text
 from calstudy.cli.options import MaxMemory, Overwrite, named_as_options
 
 if TYPE_CHECKING:
@@ -303,7 +304,7 @@ def compare_gains(
     for path in save_figure(figure, figure_arrays(found), folder, NAME):
         typer.echo(f"{path}")
     path = folder / f"{NAME}.json"
-    path.write_text(json.dumps(numbers, indent=1), encoding="utf-8")
+    write_text(path, json.dumps(numbers, indent=1))
     typer.echo(f"{path}")
 
 

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import InputError, errors_of_files
+from calstudy.base.files import write_text
 from calstudy.cli.options import MaxMemory, Overwrite, Scale, Set, StudyFile, Workers
 
 Format = Annotated[str, typer.Option("--format", help="uvh5, uvfits or ms (which takes python-casacore).")]
@@ -103,8 +104,9 @@ def score(
         worlds = load_worlds(file, scale, overrides or (), blocks)
         found = measure_scores(worlds, Budget(workers, max_memory), console)
     if output is not None:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        output.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        with errors_of_files(f"--output {output}: cannot be written"):
+            output.parent.mkdir(parents=True, exist_ok=True)
+            write_text(output, found.model_dump_json(indent=1) + "\n")
     for world, table in tables(found).items():
         console.print(f"{world}:\n{table.markdown()}", markup=False)
     for world, calibrator, why in found.refusals:

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from calstudy.base.errors import InputError, errors_of_files
+from calstudy.base.files import write_text
 from calstudy.cli.options import named_as_options
 
 if TYPE_CHECKING:
@@ -63,7 +64,8 @@ def init(
     if not STUDY_NAME.fullmatch(name):
         raise InputError(f"{name!r} cannot name an experiment: use at most 64 letters, digits, '_', '.', '-'")
     if data is not None:
-        text = _filled("observed", name=name, beam=beam or "hera", **_described(data))
+        guess = "" if beam else "                                              # a guess: files of data do not say it"
+        text = _filled("observed", name=name, beam=beam or "hera", beam_reason=guess, **_described(data))
     else:
         text = _filled("starter", name=name) if example is None else _copy(example, name)
     if path.exists():
@@ -71,7 +73,12 @@ def init(
     schema = published("experiments") / SCHEMA_FILE
     if schema.is_relative_to(Path.cwd()):
         schema = schema.relative_to(Path.cwd())
-    path.write_text(f"{MODELINE}{schema}\n{text}", encoding="utf-8")
+    with errors_of_files(f"{path}: cannot be written"):
+        write_text(path, f"{MODELINE}{schema}\n{text}")
+    if data is not None and beam is None:
+        typer.echo(
+            f"{path}: observed.beam = hera is a guess, which sets the level of power spectra; --beam names another"
+        )
     typer.echo(f"{path}: next, `calstudy plan {path}`")
 
 
@@ -172,7 +179,7 @@ def write_schema(path: Path) -> None:
     with errors_of_files(f"--schema {path}: cannot be written"):
         if path.exists() and SCHEMA_TITLE not in path.read_text(encoding="utf-8", errors="replace"):
             raise InputError(f"--schema {path}: is another file, and is not overwritten; choose another name")
-        path.write_text(experiment_schema(), encoding="utf-8")
+        write_text(path, experiment_schema())
     typer.echo(f"{path}")
 
 

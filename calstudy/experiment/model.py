@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, SerializeAsAny, mod
 from calstudy.base.constants import HYDROGEN_LINE
 from calstudy.base.errors import InputError
 from calstudy.base.plugins import Plugin, Registry, refusal_of
-from calstudy.base.schema import Section, fault
+from calstudy.base.schema import UNKEYED, Section, fault
 from calstudy.calibrate.interface import CALIBRATORS, Calibrator
 from calstudy.calibrate.settings import AdamaxSettings, GaussNewtonSettings, Solver
 from calstudy.corrupt.noise import Autocorrelations
@@ -124,8 +124,12 @@ class Folders(Section):
 
     holds_input_files: ClassVar[bool] = False
 
-    store: Path = Field(Path("store"), description="Folder of products, shared by all studies.")
-    runs: Path = Field(Path("runs"), description="Folder in which each run gets its own folder.")
+    store: Path = Field(
+        Path("store"), description="Folder of products, shared by all studies.", json_schema_extra=UNKEYED
+    )
+    runs: Path = Field(
+        Path("runs"), description="Folder in which each run gets its own folder.", json_schema_extra=UNKEYED
+    )
 
     @model_validator(mode="after")
     def _folders_differ(self) -> Self:

@@ -233,8 +233,8 @@ def _warnings(by_status: Mapping[str, int], records: list[Mapping[str, Any]], me
     sentences = []
     if "stalled" in by_status:
         sentences.append(
-            "where solves stall, results depend on where they start: T is not determined better than by the spread of "
-            "two starts, which another 'calibration.chunks' shows; T of the linear response, beside it, does not "
+            "where solves stall, results depend on where they start: neither gains nor T are determined better than by "
+            "the spread of two starts, such as with another 'calibration.chunks'; T of the linear response does not "
             "depend on them"
         )
     if 0 < lost < 1:

@@ -132,7 +132,7 @@ def noise_power(graph: MeasuredGraph, what: str, source: str) -> Task:
     return cross_power(graph, noise.label, [noise, noise], own)
 
 
-class Observe(Task, stage="observe", version=7):
+class Observe(Task, stage="observe", version=8):
     """The data of one part, and the sky model at the same samples."""
 
     files: Sequence[Path]

@@ -62,7 +62,7 @@ REGIONS = {"outside-wedge": False, "inside-wedge": True}
 """Parts of Fourier space; true for the part inside the wedge."""
 SCALE, SUMMARY = "scale.json", "summary.csv"
 NOTE = (
-    "T = P^R / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR, free "
+    "T = P^D / P^S by injection: the power of the response of the residual to the EoR, over the power of the EoR, free "
     "of the error of the calibration's flux scale where the true gains are known. The squared coherence of response "
     "and EoR does not need these; for spectra of each baseline with itself it is the fraction of the power that is "
     "retained. One standard deviation."

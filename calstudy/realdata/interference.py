@@ -46,7 +46,7 @@ def flag_interference(data: UVData, settings: Interference) -> str:
     that have it, in any polarization; a channel if a twentieth of all its samples stand out; an integration if half of
     all its samples do. Autocorrelations do not take part: their noise is so low that the bandpass stands out.
 
-    The data must be rectangular and time-major, and are changed. Flagged samples do not take part, and stay flagged.
+    The data must be rectangular and time-major, and are changed. Samples that are flagged or zero do not take part.
     Raise InputError if there are only autocorrelations, or too few integrations or channels that are not flagged.
     """
     pairs = antenna_pairs(data)
@@ -54,7 +54,8 @@ def flag_interference(data: UVData, settings: Interference) -> str:
     if not crosses.any():
         raise InputError("flag_interference: is for cross-correlations, and the data hold none")
     cube, flags = to_cube(data), flag_cube(data)
-    known = ~flags[:, crosses] & np.isfinite(cube[:, crosses])
+    # Correlators write zeros where they have no data.
+    known = ~flags[:, crosses] & np.isfinite(cube[:, crosses]) & (cube[:, crosses] != 0)
     times, channels = int(known.any(axis=(1, 2, 3)).sum()), int(known.any(axis=(0, 1, 3)).sum())
     require_surroundings(times, channels)
     found = np.zeros((data.Ntimes, data.Nfreqs), bool)

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 MEDIAN_OVER_MEAN = np.log(2)
 ABOVE_NOISE = 2.0
 """Antennas with a baseline of more than so many times the median power of noise correlate with another."""
+FAINT = 1e-3
+"""Without autocorrelations baselines with a smaller fraction of the array's median power are noise."""
 TYPICAL_PARTNERS = 4
 """Where the median antenna correlates with so many others, one with a single other has cross-talk, and sees no sky."""
 
@@ -83,7 +85,8 @@ def uncorrelated(data: UVData) -> list[int]:
     """Return the numbers of antennas that see no sky: their cross-correlations are zero, flagged, noise or cross-talk.
 
     Of noise alone is a baseline whose median of |V|^2 / sigma^2, by the radiometer equation, is less than `ABOVE_NOISE`
-    times that of noise. None are named if they were half of all: then the data are no measure of them.
+    times that of noise; without autocorrelations, whose median of |V|^2 is less than `FAINT` of that of all baselines.
+    None are named if they were half of all: then the data are no measure of them.
     """
     pairs = antenna_pairs(data)
     crosses = np.not_equal(*pairs.T)
@@ -91,10 +94,13 @@ def uncorrelated(data: UVData) -> list[int]:
     seen = np.asarray(np.any(values > 0, axis=(0, 2)))
     for polarization in range(data.Npols):
         variance = radiometer_variance(data, pairs, polarization)
-        if variance is not None:
-            ratios = np.ma.masked_invalid(np.where(values[..., polarization] > 0, values[..., polarization], np.nan))
-            medians = np.ma.median(ratios / np.ma.masked_invalid(variance), axis=(0, 2)).filled(np.inf)
-            seen[:, polarization] &= medians > ABOVE_NOISE * MEDIAN_OVER_MEAN
+        known = np.ma.masked_less_equal(np.nan_to_num(values[..., polarization]), 0)
+        if variance is None:
+            medians, least = np.ma.median(known, axis=(0, 2)), FAINT * np.ma.median(known)
+        else:
+            medians = np.ma.median(known / np.ma.masked_invalid(variance), axis=(0, 2))
+            least = ABOVE_NOISE * MEDIAN_OVER_MEAN
+        seen[:, polarization] &= medians.filled(np.inf) > least
     numbers = np.unique(pairs)
     counts = np.bincount(np.searchsorted(numbers, pairs[seen.any(axis=1)]).ravel(), minlength=numbers.size)
     lost = numbers[counts <= (1 if np.median(counts) >= TYPICAL_PARTNERS else 0)]

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from calstudy.base.errors import InputError
 from calstudy.base.gains import read_gain_errors
@@ -123,7 +124,14 @@ class Tables:
     @property
     def summary(self) -> Mapping[str, Any]:
         """The content of score.json: scores in bands, flux scale, errors of gains, statuses and cost of the solves."""
-        return _undamaged(self.path(SCORE, NO_SCORES), read_json)
+
+        def read(path: Path) -> dict[str, Any]:
+            found = read_json(path)
+            if not isinstance(found, dict) or any(len(band["k"]) != 2 for band in found["bands"]):
+                raise ValueError("not a score")
+            return found
+
+        return _undamaged(self.path(SCORE, NO_SCORES), read)
 
     def measured(self, name: str) -> Statistic:
         """Return a comparison of the calibration with the truth (`calstudy.calibrate.agreement`)."""
@@ -204,7 +212,10 @@ def by_wavenumber(spectrum: SphericalSpectrum | TransferFunction | Score) -> xar
     arrays = {item.name: (("k",), getattr(spectrum, item.name)) for item in _arrays(spectrum)}
     edges = spectrum.bin_edges
     arrays |= {"k_from": (("k",), edges[:-1]), "k_to": (("k",), edges[1:])}
-    return _dataset(spectrum, arrays, ("k", "k_from", "k_to"))
+    found = _dataset(spectrum, arrays, ("k", "k_from", "k_to"))
+    if isinstance(spectrum, SphericalSpectrum):
+        found["difference_error"] = (("k",), spectrum.difference_error, found.noise_error.attrs)
+    return found
 
 
 def by_length_and_delay(spectrum: CylindricalSpectrum | TransferMap) -> xarray.Dataset:
@@ -276,6 +287,21 @@ def arrays_of_figure(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: the arrays of the figure cannot be read ({error})") from None
 
 
+class _Manifest(BaseModel):
+    """What is read of a manifest; it has more, and those of earlier versions have less."""
+
+    name: str
+    products: list[dict[str, Any]] = []
+    tables: list[str] = []
+    captions: dict[str, str] = {}
+    parts: dict[str, str] = {}
+    members: dict[str, str] = {}
+    stand_ins: list[str] = []
+    warnings: list[str] = []
+    versions: dict[str, Any] = {}
+    machine: dict[str, Any] = {}
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """The folder of a finished run, or of a reference, whose figures are beside its manifest.
@@ -295,8 +321,11 @@ class RunFolder:
             raise InputError(f"{self.path}: {NO_RUN} ({MANIFEST}: {error.strerror})") from None
         except ValueError:
             raise InputError(f"{path}: not valid JSON; the same run again writes it anew") from None
-        if not isinstance(found, dict) or "name" not in found:
-            raise InputError(f"{path}: not the manifest of a run")
+        try:
+            _Manifest.model_validate(found)
+        except ValidationError as error:
+            field = ".".join(map(str, error.errors()[0]["loc"]))
+            raise InputError(f"{path}: not the manifest of a run{f' ({field})' if field else ''}; {AGAIN}") from None
         return found
 
     @property

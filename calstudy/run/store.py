@@ -153,10 +153,13 @@ class Store:
     def discard(self, stage: str, key: str) -> None:
         """Remove a product, if it exists; its name disappears at once."""
         folder = self.folder(stage, key)
-        if folder.exists():
+        if os.path.lexists(folder):
             grave = folder.parent / f".discarded-{key}-{uuid4().hex}"
             folder.rename(grave)
-            shutil.rmtree(grave, ignore_errors=True)
+            if grave.is_symlink():
+                grave.unlink()
+            else:
+                shutil.rmtree(grave, ignore_errors=True)
 
     def remove(self, stage: str, key: str) -> None:
         """Remove a product that no run needs (`calstudy.run.store`), and the file of its lock."""

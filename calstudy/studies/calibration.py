@@ -207,7 +207,26 @@ class DataCalibration(DataStudy):
                         f"also: calfits holds gains at equal distances, and the {what} of the data have gaps; take "
                         f"h5parm, or {GAINS} alone"
                     )
-        return cls(content, Parts({WHOLE: facts}))
+        found = cls(content, Parts({WHOLE: facts}))
+        found._require_kept_inputs()
+        return found
+
+    @property
+    def _inputs(self) -> set[Path]:
+        """The files that are read, with their links resolved."""
+        section = self.file.observed
+        named = (value for _, value in leaves(self.file.calibration.model_dump()) if isinstance(value, Path))
+        return {path.resolve() for path in (*section.data, section.sky_model, *named) if path is not None}
+
+    def _require_kept_inputs(self) -> None:
+        """Raise InputError if a result would replace a file that is read."""
+        also = (Path(GAINS).with_suffix(SUFFIXES[kind]).name for kind in self.file.also)
+        for name in (GAINS, MODEL, RESIDUAL, SOLUTION, *also):
+            if (self.outputs.runs / name).resolve() in self._inputs:
+                raise InputError(
+                    f"output = {self.outputs.runs}: {name} in it is an input, and a result would replace it; choose "
+                    "another folder"
+                )
 
     @property
     def content(self) -> Any:
@@ -336,11 +355,8 @@ class DataCalibration(DataStudy):
         """Remove results of an earlier calibration that this one does not replace, but for files that it reads."""
         if not (folder / SOLUTION).exists():
             return
-        section = self.file.observed
-        named = (value for _, value in leaves(self.file.calibration.model_dump()) if isinstance(value, Path))
-        read = {path.resolve() for path in (*section.data, section.sky_model, *named) if path is not None}
         for path in (folder / name for name in results_in(folder)):
-            if path.name not in written and path.resolve() not in read:
+            if path.name not in written and path.resolve() not in self._inputs:
                 path.unlink()
 
     def _solution(self, made: RunProducts, solved: Mapping[str, Any], found: dict[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from calstudy import __version__
 from calstudy.base.errors import InputError
-from calstudy.base.files import sha256
+from calstudy.base.files import sha256, write_text
 from calstudy.base.gain_files import CASACORE
 from calstudy.base.paths import leaves
 from calstudy.base.visibilities import flag_cube, from_cube, to_cube
@@ -39,7 +39,7 @@ from calstudy.products.files import DATA, VISIBILITIES, read_visibilities, write
 from calstudy.run.execution import Budget, Workers
 from calstudy.run.store import Product, Store, require_writable
 from calstudy.studies.capacity import fit
-from calstudy.studies.folder import folder_of_runs, log_to, write
+from calstudy.studies.folder import folder_of_runs, log_to
 from calstudy.studies.kinds.comparison import Comparison, WorldData, load_worlds
 from calstudy.studies.preflight import require_possible
 from calstudy.studies.study import make
@@ -162,8 +162,8 @@ def _write_world(content: WorldData, products: Mapping[str, Product], folder: Pa
         sky_model_digest=None if model is None else salted(model.key, content.salt),
         noise=None if level is None else read_noise(products[level.key].path),
     )
-    write(folder / README, _readme(manifest, template, file_format))
-    write(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+    write_text(folder / README, _readme(manifest, template, file_format))
+    write_text(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
 
 
 def _at(template: UVData, uvd: UVData) -> UVData:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from calstudy.base.errors import InputError, errors_of_files, exit_status
-from calstudy.base.files import replacing
+from calstudy.base.files import replacing, write_text
 from calstudy.experiment.model import Folders
 from calstudy.results.reader import EXPERIMENT, MANIFEST
 from calstudy.run.provenance import git_commit, machine, of_other_code, other_code, package_versions
@@ -92,12 +92,6 @@ def _remove_leftovers(folder: Path) -> None:
                 path.unlink()
 
 
-def write(path: Path, text: str) -> None:
-    """Write a text file completely or not at all."""
-    with replacing(path) as file:
-        file.write(text.encode())
-
-
 def publish(products: list[Product], folder: Path) -> None:
     """Copy the files of products into a folder of the run, each completely or not at all."""
     folder.mkdir(exist_ok=True)
@@ -118,7 +112,7 @@ def write_manifest(folder: Path, name: str, fields: Mapping[str, Any]) -> None:
         "other_code": other_code([entry["stage"] for entry in fields["products"] if "made_with" in entry]),
         **fields,
     }
-    write(folder / MANIFEST, manifest_text(manifest))
+    write_text(folder / MANIFEST, manifest_text(manifest))
     _remove_leftovers(folder)
 
 

@@ -16,11 +16,12 @@ from calstudy.base.observation import Frame
 from calstudy.base.plugins import guarded
 from calstudy.calibrate.execution import require_calibratable
 from calstudy.calibrate.interface import Calibrator
+from calstudy.calibrate.settings import ForegroundFit
 from calstudy.corrupt.interface import require_usable
 from calstudy.experiment.assumed import FIELD, SKY_MODEL, assumed_changes, assumed_world
 from calstudy.experiment.model import Experiment
 from calstudy.instrument.interface import model_of
-from calstudy.instrument.layouts import Layout, make_array, make_layout, size_of_instrument
+from calstudy.instrument.layouts import Layout, make_array, make_layout, redundant_groups, size_of_instrument
 from calstudy.instrument.settings import Channels, InstrumentSettings, nominal_beams
 from calstudy.power.interface import require_antennas, require_modes
 from calstudy.products.corruption import PARITIES, data
@@ -139,8 +140,41 @@ def _require_small_errors(instrument: InstrumentSettings) -> None:
 
 def notes_of(experiment: Experiment) -> tuple[str, ...]:
     """Return sentences on settings that are allowed, but probably a mistake."""
-    found = (_needless_limit, _average, _needless_chunks, _needless_pieces, _distant_box, _coarse_maps)
+    found = (
+        _needless_limit,
+        _absent_sources,
+        _no_groups,
+        _average,
+        _needless_chunks,
+        _needless_pieces,
+        _distant_box,
+        _coarse_maps,
+    )
     return tuple(note for note in (note(experiment) for note in found) if note)
+
+
+def _absent_sources(experiment: Experiment) -> str:
+    true, assumed = (world.sky.foregrounds for world in (experiment, assumed_world(experiment)))
+    there, given = (getattr(foregrounds, "count", None) or 0 for foregrounds in (true, assumed))
+    if not 0 < there < given or true.with_defaults("count") != assumed.with_defaults("count"):
+        return ""
+    return (
+        f"{FIELD}.sky.foregrounds.count = {given}: the sky has {there} sources, and the sky model of the calibrator "
+        f"{given - there} that are not there; to leave out some, give a smaller number"
+    )
+
+
+def _no_groups(experiment: Experiment) -> str:
+    calibration = experiment.calibration
+    if not isinstance(calibration, ForegroundFit) or calibration.reference != "calamity-redundant":
+        return ""
+    vectors, tolerance = frame_of(assumed_world(experiment).instrument).vectors, calibration.redundancy_tolerance
+    if not experiment.calibrates or redundant_groups(vectors, tolerance).index.max() < len(vectors) - 1:
+        return ""
+    return (
+        f"calibration.calibrator = 'calamity-redundant': no two baselines are within {tolerance:g} m of each other, so "
+        "that each is a group, as with 'calamity'"
+    )
 
 
 def _needless_limit(experiment: Experiment) -> str:

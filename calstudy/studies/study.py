@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
-from calstudy.base.errors import InputError
-from calstudy.base.files import digest_json
+from calstudy.base.errors import InputError, errors_of_files
+from calstudy.base.files import digest_json, write_text
 from calstudy.base.identity import identity
 from calstudy.base.paths import texts
 from calstudy.base.plugins import Registry
@@ -38,7 +38,6 @@ from calstudy.studies.folder import (
     open_folder,
     product_entries,
     publish,
-    write,
     write_manifest,
 )
 
@@ -254,12 +253,12 @@ class Study(ABC):
         if self.tables:
             publish([made.products[task.key] for task in self.tables], self.folder / "tables")
             shown = [table for task in self.tables for table in task.shown(made.products[task.key].path)]
-            write(self.folder / "tables" / SHOWN, to_json(shown))
+            write_text(self.folder / "tables" / SHOWN, to_json(shown))
         if self.claims is not None:
             publish([made.products[self.claims.key]], self.folder)
         for name, text in self.texts.items():
             (self.folder / name).parent.mkdir(exist_ok=True)
-            write(self.folder / name, text)
+            write_text(self.folder / name, text)
         places = {name: os.path.relpath(part.folder, self.folder) for name, part in self.parts.items()}
         entries = {
             "description": self.description,
@@ -371,6 +370,11 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
 def _filled(study: Study, made: RunProducts) -> Run:
     parts = {name: _filled(part, made) for name, part in study.parts.items()}
     own = made.subset(study.tasks)
-    study.write_results(own)
-    write_report(study.folder)
+    with errors_of_files(f"outputs.runs = {str(study.outputs.runs)!r}: {study.folder.name} cannot be written"):
+        try:
+            study.write_results(own)
+        except FileNotFoundError as error:
+            missing = f"{error.filename}: was removed while the results were written"
+            raise InputError(f"{missing}; run again, which makes what is missing") from None
+        write_report(study.folder)
     return Run(study.folder, own, tuple(study.tasks), parts)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 from rich.console import Console
 
 from calstudy.base.errors import ExperimentError, InputError
+from calstudy.base.files import write_text
 from calstudy.base.package_files import published
 from calstudy.claims.paper import stand_ins, unique_notes
 from calstudy.experiment.files import StudyFile, checked, overridden, validate
@@ -20,7 +21,7 @@ from calstudy.products.files import read_json
 from calstudy.run.execution import Budget
 from calstudy.run.task import Task
 from calstudy.studies.capacity import fit
-from calstudy.studies.folder import publish, write
+from calstudy.studies.folder import publish
 from calstudy.studies.study import RunProducts, Study, run_study
 from calstudy.validation.step import CHAIN, FINDINGS, MINREDUNDANT, STEPS, Case, Step, inputs_of, step_task
 from calstudy.verdicts.criterion import Verdict
@@ -131,10 +132,10 @@ class Ladder(Study):
         """Write the table of all limits, the files of each measurement, and the manifest."""
         judged = self.judge(made)
         verdicts = [verdict for _, found, _ in judged for verdict in found]
-        write(self.folder / CLAIMS_JSON, to_json(verdicts) + "\n")
+        write_text(self.folder / CLAIMS_JSON, to_json(verdicts) + "\n")
         text = to_markdown(verdicts, self.description, ("step", "proves"), tally(verdicts), self.stand_ins)
         remarks = [f"- {step.number}: {remark}\n" for step, _, found in judged for remark in found]
-        write(self.folder / CLAIMS_MARKDOWN, "".join([text, "\n", *remarks]))
+        write_text(self.folder / CLAIMS_MARKDOWN, "".join([text, "\n", *remarks]))
         (self.folder / "tables").mkdir(exist_ok=True)
         for number, task in self.measurements.items():
             publish([made.products[task.key]], self.folder / "tables" / number)

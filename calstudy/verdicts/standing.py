@@ -285,8 +285,8 @@ def _advice_in_band(entries: Sequence[InBand]) -> list[str]:
         parts += [f"others that pass: {_listed(others)}"] if others else []
     parts += [f"open: {_listed(undecided)}"] if undecided else []
     tempting = [entry for entry in failed if entry.transfer > least and 2 * len(entry.decisive) <= len(entry.worlds)]
-    keeps = "keeps more" if passed else "keeps much"
-    parts += [f"{entry.calibrator} {keeps} ({entry.kept}), but {entry}" for entry in tempting[:NAMED]]
+    words = "{} keeps more ({}), but {}" if passed else "{} ({}) {}"
+    parts += [words.format(entry.calibrator, entry.kept, entry) for entry in tempting[:NAMED]]
     unnamed = len(failed) > len(tempting[:NAMED])
     return [*parts, f"{len(failed)} of {len(entries)} fail"] if unnamed else parts
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as TerminalTable
 
+from calstudy.base.files import write_text
 from calstudy.base.table import Table, coloured, number
 from calstudy.verdicts.criterion import Verdict
 
@@ -214,10 +215,10 @@ def write_claims(
     without_role: Sequence[str] = (),
 ) -> None:
     """Write verdicts to claims.json and claims.md in a folder, with reasons why papers have none, `without_role`."""
-    (folder / CLAIMS_JSON).write_text(to_json(verdicts) + "\n", encoding="utf-8")
+    write_text(folder / CLAIMS_JSON, to_json(verdicts) + "\n")
     summary = None if verdicts else "No claims."
     text = to_markdown(verdicts, f"Claims of the paper: {title}", ("claim", "the paper"), summary, notes)
-    (folder / CLAIMS_MARKDOWN).write_text("\n".join([text, *without_role]).rstrip() + "\n", encoding="utf-8")
+    write_text(folder / CLAIMS_MARKDOWN, "\n".join([text, *without_role]).rstrip() + "\n")
 
 
 STATEMENT = ("name", "section", "sentence", "sentence_id", "tests_simulation", "quantity", "threshold", "why")
@@ -237,13 +238,13 @@ def write_claims_by_solver(
         statement = {name: getattr(row[0], name) for name in STATEMENT}
         results = ({name: getattr(item, name) for name in RESULT} for item in row)
         found.append({**statement, "solvers": dict(zip(columns, results, strict=True))})
-    (folder / BY_SOLVER_JSON).write_text(_dumped(found) + "\n", encoding="utf-8")
+    write_text(folder / BY_SOLVER_JSON, _dumped(found) + "\n")
     tallies = "\n".join(f"- {name}: {tally([row[place] for row in rows])}" for place, name in enumerate(columns))
     differing = f"The verdict differs: {', '.join(_differing(rows)) or 'nowhere'}."
     head = f"# Claims of the paper, by solver: {title}\n\n{tallies}\n\n{differing}\n"
     headings = ("claim", "the paper", "measured is", "must be", *(cell for name in columns for cell in (name, "")))
     text = _document(head, notes, headings, [(row[0].section, _cells_by_solver(row)) for row in rows])
-    (folder / BY_SOLVER_MARKDOWN).write_text(text.rstrip() + "\n", encoding="utf-8")
+    write_text(folder / BY_SOLVER_MARKDOWN, text.rstrip() + "\n")
 
 
 def _differing(rows: Iterable[Sequence[Verdict]]) -> list[str]:

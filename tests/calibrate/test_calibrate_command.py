@@ -20,6 +20,7 @@ from toy_data import make_uvdata
 
 import calstudy
 from calstudy.base.errors import InputError
+from calstudy.base.files import sha256
 from calstudy.base.gain_files import read_gains
 from calstudy.base.gains import make_uvcal
 from calstudy.base.observation import Observation
@@ -248,16 +249,30 @@ def test_results_that_are_replaced_leave_none_of_the_earlier_calibration(command
 
 
 @pytest.mark.parametrize(
+    ("name", "option"), [("residual.uvh5", None), ("model.uvh5", "--sky-model"), ("gains.calh5", "--gains")]
+)
+def test_a_result_never_replaces_an_input(command, data, finished, tmp_path, name, option):
+    shutil.copytree(finished[0] / "out", tmp_path / "out")
+    before = sha256(tmp_path / "out" / name)
+    given = [f"out/{name}"] if option is None else [data, option, f"out/{name}"]
+    for more in ([], ["--dry-run"]):
+        code, error = command(*given, *OPTIONS, "--output", "out", "--overwrite", *more)
+        assert code == 2
+        assert f"--output out: {name} in it is an input, and a result would replace it; choose another folder" in error
+    assert sha256(tmp_path / "out" / name) == before
+
+
+@pytest.mark.parametrize(
     ("settings", "kept"),
     [
-        ({"calibrator": "by-file", "gains": "gains.h5", "model": "model.uvh5"}, {"gains.h5", "model.uvh5"}),
+        ({"calibrator": "by-file", "gains": "gains.h5", "model": "sky.uvh5"}, {"gains.h5", "sky.uvh5"}),
         ({"weights": {"kind": "file", "path": "gains.fits"}}, {"gains.fits"}),
         ({"initial_gains": {"kind": "file", "path": "gains.h5"}}, {"gains.h5"}),
     ],
 )
 def test_files_that_a_calibration_reads_are_not_removed(data, monkeypatch, tmp_path, settings, kept):
     monkeypatch.chdir(tmp_path)
-    for name in ("gains.h5", "gains.fits", "model.uvh5", "residual.uvh5", "solution.json"):
+    for name in ("gains.h5", "gains.fits", "model.uvh5", "residual.uvh5", "solution.json", *kept):
         (tmp_path / name).touch()
     sections = {"observed": {"data": [str(data)]}, "calibration": settings}
     DataCalibration.load(calibration_file(sections, tmp_path))._remove_earlier(tmp_path, {"solution.json"})

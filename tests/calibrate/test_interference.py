@@ -192,6 +192,27 @@ def test_antennas_without_a_signal_are_named_unless_they_are_half(clean):
     assert uncorrelated(data) == []
 
 
+def test_an_antenna_of_noise_is_named_without_autocorrelations_as_well(clean):
+    data = clean.copy()
+    dead = (data.ant_1_array == 12) | (data.ant_2_array == 12)
+    # Of an amplifier whose antenna is not connected: 2 % of the noise of the others.
+    data.data_array[dead] *= 1e-3
+    assert uncorrelated(data) == [12]
+    # Antennas that differ in gain by ten see the sky.
+    data.data_array[dead] = clean.data_array[dead] / 10
+    assert uncorrelated(data) == []
+
+
+def test_zeros_of_an_antenna_are_not_interference(clean):
+    data, _ = spoiled(clean)
+    zero = (data.ant_1_array == 12) | (data.ant_2_array == 12)
+    left = data.select(blt_inds=np.flatnonzero(~zero), inplace=False)
+    data.data_array[zero] = 0
+    for each in (data, left):
+        flag_interference(each, Interference())
+    assert np.array_equal(flag_cube(data)[:, 0], flag_cube(left)[:, 0])
+
+
 @pytest.mark.parametrize(
     ("name", "lost"),
     [

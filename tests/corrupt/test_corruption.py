@@ -151,6 +151,14 @@ def test_gains_read_from_a_file_are_those_written(template, rng, tmp_path):
     assert np.array_equal(draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))["gains"], gains)
 
 
+def test_gains_of_a_file_are_those_of_their_times_in_any_order(template, rng, tmp_path):
+    gains = complex_normal(rng, (template.Nants_telescope, template.Nfreqs, template.Ntimes, template.Npols))
+    cal = make_uvcal(template, gains)
+    cal.reorder_times("-time")
+    cal.write_calh5(tmp_path / "g.calh5")
+    assert np.array_equal(draw_truth(FileGains(path=tmp_path / "g.calh5"), Observation(template))["gains"], gains)
+
+
 def test_gains_of_other_channels_or_antennas_are_refused(template, tmp_path):
     unity = make_uvcal(template, np.ones((template.Nants_telescope, template.Nfreqs, 1, template.Npols), complex))
     shifted = unity.copy()

@@ -283,6 +283,10 @@ def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tm
         ("power.coherent_time=1 s", "is shorter than an integration of"),
         ("simulation.chunks=50", "simulation.chunks = 50: the EoR is simulated in"),
         ("calibration.chunks=50", "calibration.chunks = 50: there are"),
+        (
+            "calibration.assumed={sky.foregrounds.count: 150}",
+            "calibration.assumed.sky.foregrounds.count = 150: the sky has 100 sources, and the sky model of the",
+        ),
     ],
 )
 def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path, capsys, monkeypatch):
@@ -290,6 +294,21 @@ def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path,
     Path("file.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
     assert told not in " ".join(planned(capsys).split())
     assert told in " ".join(planned(capsys, "--set", change, "--set", "instrument.times.integration=10 s").split())
+
+
+def test_a_model_for_each_group_of_an_array_without_groups_is_noted_in_a_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("file.yaml").write_text(
+        yaml.safe_dump({**tiny(tmp_path), "calibration": {"calibrator": "calamity-redundant"}})
+    )
+    told = "calibration.calibrator = 'calamity-redundant': no two baselines are within"
+    assert told not in " ".join(planned(capsys).split())
+    Path("random.csv").write_text("east_m,north_m,up_m\n0,0,0\n14,3,0\n-6,19,0\n31,-8,0\n")
+    assert told in " ".join(
+        planned(
+            capsys, "--set", "instrument.layout={kind: csv, path: random.csv}", "--set", "instrument.location=mwa"
+        ).split()
+    )
 
 
 def test_a_run_shows_the_notes_of_its_plan(tmp_path, capsys, monkeypatch):

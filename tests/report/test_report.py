@@ -267,6 +267,11 @@ def test_what_is_no_run_folder_is_told(folder, tmp_path_factory):
     (folder / "manifest.json").write_text("{")
     with pytest.raises(InputError, match="not valid JSON"):
         write_report(folder)
+    for field in ("products", "tables", "captions", "parts", "stand_ins", "warnings", "versions", "machine"):
+        for wrong in (3, "x", [1], None):
+            (folder / "manifest.json").write_text(json.dumps({**MANIFEST, field: wrong}))
+            with pytest.raises(InputError, match=rf"not the manifest of a run \({field}.*\); run the experiment again"):
+                write_report(folder)
     (folder / "manifest.json").write_text("[]")
     with pytest.raises(InputError, match="not the manifest"):
         write_report(folder)

@@ -44,6 +44,18 @@ def test_a_sealed_product_is_found_and_verified(store):
     assert product.size == len(b"visibilities")
 
 
+def test_a_link_that_leads_nowhere_is_replaced_by_the_product(store, tmp_path):
+    """Products may be kept on a disk that is emptied."""
+    make_product(store)
+    store.folder("stage", KEY).rename(tmp_path / "elsewhere")
+    store.folder("stage", KEY).symlink_to(tmp_path / "elsewhere")
+    assert store.verify("stage", KEY) is not None
+    (tmp_path / "elsewhere").rename(tmp_path / "gone")
+    make_product(store)
+    assert store.verify("stage", KEY) is not None
+    assert not store.folder("stage", KEY).is_symlink()
+
+
 def test_a_product_does_not_exist_before_it_is_sealed(store):
     with store.lock("stage", KEY), store.building("stage", KEY) as folder:
         (folder / "data.bin").write_bytes(b"half")

@@ -90,6 +90,20 @@ def test_smaller_pieces_are_the_same_products(paper):
     assert ExperimentStudy(paper).folder == ExperimentStudy(little).folder
 
 
+def test_the_run_folder_is_named_by_the_study_alone(tmp_path, monkeypatch):
+    """And not by what lies in the folders of products and runs, which would also be read in full."""
+    monkeypatch.chdir(tmp_path)
+    content = override(tiny(tmp_path), "outputs.figures", ["spherical"])
+    outputs = {name: value for name, value in content["outputs"].items() if name not in ("store", "runs")}
+    names = []
+    for folder in (None, "store", "runs"):
+        if folder is not None:
+            (tmp_path / folder).mkdir()
+            (tmp_path / folder / "file").write_text("content")
+        names.append(ExperimentStudy(validate({**content, "outputs": outputs}, tmp_path)).folder.name)
+    assert len(set(names)) == 1
+
+
 def test_a_strict_run_has_room_for_what_is_of_other_code(paper):
     """Such a product is in the store, and is made again."""
 

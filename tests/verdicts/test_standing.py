@@ -207,7 +207,7 @@ def test_the_smallest_t_is_not_said_of_worlds_where_it_is_not_measured():
         failed = standing_of(case(0.0, 0.01, transfer=0.8), lost, refusals=[("sources missing", "name", "why")])
         assert advice([failed])[1] == (
             "k 0.1 to 0.2 h/Mpc: no calibrator passes; "
-            f"name keeps much (T ≥ 0.80 where measured, 1 of 2 worlds), but fails in sources missing ({reason})"
+            f"name (T ≥ 0.80 where measured, 1 of 2 worlds) fails in sources missing ({reason})"
         )
     assert "where" not in str(standing_of(case(0.0, 0.01), case(0.0, 0.01)))
 

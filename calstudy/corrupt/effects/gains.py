@@ -21,7 +21,7 @@ from pydantic import Field
 from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.errors import InputError
 from calstudy.base.gain_files import read_gains
-from calstudy.base.gains import gains_for
+from calstudy.base.gains import gains_for, solution_times
 from calstudy.base.schema import Section
 from calstudy.base.units import Delay, Fraction, Frequency, Time
 from calstudy.corrupt.drift import Polynomial, Shape, is_named, refusal_of_antennas
@@ -193,8 +193,10 @@ def reflection_gain(
 class FileGains(GainEffect):
     """Gains read from a file with the same antennas and channels; flagged ones count as unity.
 
-    The file holds gains for one time, which are constant, or for as many as there are integrations, in their order.
+    The file holds gains for one time, which are constant, or for as many as there are integrations, in order of time.
     """
+
+    version: ClassVar[int] = 2
 
     kind: str = "file-gains"
     path: Path = Field(description="File of gains, relative to the experiment file or absolute.")
@@ -206,7 +208,8 @@ class FileGains(GainEffect):
         has another number of times.
         """
         del random
-        values = gains_for(read_gains(self.path, "corruption.effects: path", observation.uvd), observation.uvd)
+        cal = read_gains(self.path, "corruption.effects: path", observation.uvd)
+        values = gains_for(cal, observation.uvd)[:, :, np.argsort(solution_times(cal))]
         if values.shape[2] not in (1, observation.n_times):
             raise InputError(
                 f"corruption.effects: path = {str(self.path)!r}: holds gains for {values.shape[2]} times; it must hold "
