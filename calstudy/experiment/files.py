@@ -35,7 +35,7 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, str) or key in keys:
-                why = "appears twice" if isinstance(key, str) else "is not a text"
+                why = "appears twice" if isinstance(key, str) else "is not a text; put it in quotes"
                 raise _refused(key_node, f"key {key!r} {why}")
             keys.add(key)
         return super().construct_mapping(node, deep)

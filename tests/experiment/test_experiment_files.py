@@ -203,7 +203,7 @@ def test_texts_that_look_like_numbers_stay_texts(in_line):
         ("a: 1\na: 2", "line 2: key 'a' appears twice"),
         ("a: [1", "line 1"),
         ("a: !!python/object:os.system {}", "python/object:os.system is refused"),
-        ("1: 2", "key 1 is not a text"),
+        ("1: 2", "key 1 is not a text; put it in quotes"),
     ],
 )
 def test_broken_yaml_is_one_sentence_with_the_line(text, told):

@@ -275,7 +275,7 @@ def describe_data(experiment: Experiment) -> str:
             f"{frame.n_antennas} antennas ({instrument.layout.label}), baselines to {frame.lengths.max():.3g} m, "
             f"beam {instrument.beam.label}",
             instrument.channels.label,
-            f"{times.count} integrations of {times.integration:g} s",
+            f"{times.count} integration{'s' if times.count > 1 else ''} of {times.integration:g} s",
             effects or "no gains",
             _noise(experiment),
         )
