@@ -68,11 +68,13 @@ class BeamModel(Plugin, ABC):
     """The settings of a beam, from which the beam is made. Fields of a subclass are its settings.
 
     Its module is imported when an experiment file is read: import slow libraries inside `make`. `dipoles` is the number
-    of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero.
+    of dipoles of an antenna, if it is a tile whose dipoles may differ (`make_tiles`), otherwise zero. `extent`, m, is
+    the length that has the delays and fringe rates of the beam's structure (`simulation.nodes.beam_extent`).
     """
 
     registry: ClassVar = BEAMS
     dipoles: ClassVar[int] = 0
+    extent: ClassVar[float] = 20.0
 
     kind: str = Field("", description="Name of a beam, or a file.py.")
 

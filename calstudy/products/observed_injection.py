@@ -176,7 +176,8 @@ class SimulateEor(Task, stage="observed-eor", version=3):
             raise ValueError("the template of the simulation has other baselines than the data")
         field = EorField(self.eor, template.freq_array, make_cosmology(self.cosmology))
         beam, simulation = make_beam(self.beam, self.channels), self.simulation
-        accuracy = simulation.nodes.accuracy(eor=True, smooth_beam=model_of(self.beam).smooth)
+        model = model_of(self.beam)
+        accuracy = simulation.nodes.accuracy(eor=True, smooth_beam=model.smooth, extent=model.extent)
         chunks = plan_chunks(template, accuracy, simulation.chunks)
         cubes = [simulate_chunk(simulation.engine, field.sky(chunk.nodes), beam, template, chunk) for chunk in chunks]
         found = from_cube(data, assemble(chunks, cubes))

@@ -216,10 +216,12 @@ class Component:
     @cached_property
     def accuracy(self) -> Accuracy:
         """Tolerance of the interpolation, and whether beam and sky are smooth in frequency."""
-        beams = [self.instrument.beam, *(group.beam for group in self.instrument.antenna_beams.values())]
-        smooth_beam = all(model_of(beam).smooth for beam in beams)
+        groups = self.instrument.antenna_beams.values()
+        beams = [model_of(beam) for beam in (self.instrument.beam, *(group.beam for group in groups))]
         smooth_sky = getattr(self._source, "spectral_type", None) in SMOOTH_SPECTRA
-        return self.simulation.nodes.accuracy(self.is_eor, smooth_beam, smooth_sky)
+        return self.simulation.nodes.accuracy(
+            self.is_eor, all(beam.smooth for beam in beams), smooth_sky, max(beam.extent for beam in beams)
+        )
 
     @cached_property
     def chunks(self) -> list[Chunk]:

@@ -33,15 +33,21 @@ class Nodes(Section):
         "hundredth of it.",
     )
     beam_extent: Length = Field(
-        20.0, ge=10, description="Length added to baselines for the structure of the beam in fringe rate and delay."
+        20.0,
+        ge=10,
+        description="Length added to baselines for the structure of the beam in fringe rate and delay, where the beam "
+        "has no larger one, as HERA's has (60 m).",
     )
 
-    def accuracy(self, eor: bool, smooth_beam: bool = True, smooth_sky: bool = True) -> Accuracy:
-        """Return the accuracy for the EoR, whose channels are independent, or for foregrounds of smooth spectra."""
+    def accuracy(self, eor: bool, smooth_beam: bool = True, smooth_sky: bool = True, extent: float = 0.0) -> Accuracy:
+        """Return the accuracy for the EoR, whose channels are independent, or for foregrounds of smooth spectra.
+
+        `extent`, m, is that of the beam.
+        """
         if not self.enabled:
             return EXACT
         tolerance = self.eor_tolerance if eor else self.tolerance
-        return Accuracy(tolerance, self.beam_extent, smooth_beam, smooth_sky and not eor)
+        return Accuracy(tolerance, max(self.beam_extent, extent), smooth_beam, smooth_sky and not eor)
 
 
 class SimulationSettings(Section):

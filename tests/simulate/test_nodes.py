@@ -8,6 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulation_cases import observe
 
+from calstudy.instrument.array_layouts.geometric import HexLayout
+from calstudy.instrument.beam_models.tables import HeraBeam
+from calstudy.instrument.settings import Channels, InstrumentSettings, Times
+from calstudy.simulate.chunks import Component, simulate_visibilities
+from calstudy.simulate.engines.dense import DenseEngine
 from calstudy.simulate.nodes import (
     EXACT,
     Accuracy,
@@ -21,6 +26,9 @@ from calstudy.simulate.nodes import (
     time_bandwidth,
     turning_length,
 )
+from calstudy.simulate.settings import SimulationSettings
+from calstudy.sky.foregrounds import make_foregrounds
+from calstudy.sky.settings import SyntheticSources
 
 DEFAULT = Accuracy(tolerance=1e-9, beam_extent=20.0)
 
@@ -126,3 +134,29 @@ def test_axes_interpolate_arrays_of_any_shape():
     expected = np.einsum("mn,nab->mab", axis.matrix, values)
     np.testing.assert_allclose(axis.interpolate(values), expected, atol=1e-13)
     np.testing.assert_allclose(axis.interpolate(values.swapaxes(1, 2)), expected.swapaxes(1, 2), atol=1e-13)
+
+
+def test_foregrounds_through_heras_beam_err_by_the_tolerance():
+    """Its structure has larger delays than that of a tile, for which the default is."""
+    array = InstrumentSettings(
+        layout=HexLayout(side=2, spacing="14.6 m"),
+        location="hera",
+        beam=HeraBeam(),
+        channels=Channels(first="167.075 MHz", width="480 kHz", count=64),
+        times=Times(count=1, integration="2 s"),
+        polarizations=("xx",),
+    )
+    sources = SyntheticSources(kind="g4jy-and-counts", count=100)
+    component = Component(array, SimulationSettings(), sources, "Planck18")
+    beam, template = component.beam, component.template
+    sky = make_foregrounds(sources, template.freq_array).sky
+
+    exact, *interpolated = (
+        simulate_visibilities(DenseEngine(), sky, beam, template, each) for each in (EXACT, component.accuracy, DEFAULT)
+    )
+    rms = np.sqrt(np.mean(np.abs(exact) ** 2))
+    own, default = (float(np.abs(cube - exact).max() / rms) for cube in interpolated)
+    assert len(frequency_axis(template, component.accuracy).nodes) < 64
+    # The bound is for phasors of the fastest fringe; a beam is none, and may err by some times more.
+    assert own < 10 * component.accuracy.tolerance
+    assert default > 1000 * component.accuracy.tolerance
