@@ -207,7 +207,7 @@ def _draw_points(axes: style.Axes, fault: Fault, cases: Sequence[Case | None], n
 class ComparisonTolerances(CasesFigure):
     """Bias and T against the severity of each fault: of worlds with labels such as ``positions: 2 cm``."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     kind: str = "comparison-tolerances"
     caption = (

@@ -1,8 +1,8 @@
 """The severity of a fault up to which a calibrator's bias is tolerable, from worlds that differ only in the severity.
 
 Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
-colon is its name, the number after it the severity. A world without a colon is severity zero of all faults that have no
-world of severity zero themselves. Negative numbers, such as levels in dB, are no severities: zero would be more.
+colon is its name, the number after it the severity. The first world without a colon is severity zero of all faults that
+have no world of severity zero themselves. Negative numbers, such as levels in dB, are no severities: zero would be more.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def faults(worlds: Sequence[str]) -> list[Fault]:
 
     Raises InputError if the units of one fault cannot be converted into each other.
     """
-    without = [(0.0, world, "") for world in worlds if ":" not in world]
+    without = [(0.0, world, "") for world in worlds if ":" not in world][:1]
     found: dict[str, list[tuple[float, str, str]]] = {}
     for world in worlds:
         name, colon, severity = world.partition(":")

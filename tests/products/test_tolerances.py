@@ -11,7 +11,8 @@ SEVERITIES = (0.0, 0.1, 1.0, 10.0)
 
 
 def test_worlds_are_grouped_by_fault_and_ordered_by_severity():
-    found = faults(["ideal", "positions: 2 cm", "flux: 1e-3", "positions: 0.5 cm", "a world apart: no number"])
+    worlds = ["ideal", "positions: 2 cm", "flux: 1e-3", "positions: 0.5 cm", "a world apart: no number", "another"]
+    found = faults(worlds)
     assert [(fault.name, fault.unit) for fault in found] == [("positions", "cm"), ("flux", "")]
     assert found[0].worlds == ("ideal", "positions: 0.5 cm", "positions: 2 cm")
     assert found[0].severities == (0.0, 0.5, 2.0)
