@@ -257,17 +257,23 @@ def test_the_store_is_found_from_any_working_directory(file, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("error", "told"),
     [
-        (FileNotFoundError(errno.ENOENT, "no", "store/figure/x"), "store/figure/x: was removed while the results were"),
-        (OSError(errno.ENOSPC, "No space left on device"), r"outputs\.runs = .* cannot be written \(No space left on"),
+        ((errno.ENOENT, "no", "{store}/figure/x"), "store/figure/x: was removed while the results were"),
+        ((errno.ENOSPC, "No space left on device"), r"outputs\.runs: .* cannot be written \(No space left on device"),
+        # Files of a user's own code are no results.
+        ((errno.ENOENT, "no", "limits.csv"), None),
+        (("my table: column 'k' is missing",), None),
     ],
 )
 def test_results_that_cannot_be_written_are_told_in_a_sentence(run, file, monkeypatch, error, told):
+    failing = OSError(*(part.format(store=file.parent / "store") if isinstance(part, str) else part for part in error))
+
     def refuse(*_):
-        raise error
+        raise failing
 
     monkeypatch.setattr("calstudy.studies.study.publish", refuse)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError if told else OSError, match=told) as caught:
         calstudy.load(file).run(workers=1, quiet=True)
+    assert told or caught.value is failing
 
 
 def test_a_product_that_a_run_did_not_need_is_named_as_such(run, tmp_path):

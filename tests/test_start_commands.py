@@ -88,6 +88,16 @@ def test_a_file_that_cannot_be_written_in_full_is_not_there(here, capsys, monkey
     assert (here / name).is_file()
 
 
+def test_a_file_that_is_a_link_stays_one(here, capsys):
+    output_of(capsys, "fields", "--schema", "real.json")
+    Path("link.json").symlink_to("real.json")
+    before = Path("real.json").read_text()
+    Path("real.json").write_text(before + " ")
+    output_of(capsys, "fields", "--schema", "link.json")
+    assert Path("link.json").is_symlink()
+    assert Path("real.json").read_text() == before
+
+
 def test_a_published_experiment_can_be_copied_under_another_name(here, capsys):
     output_of(capsys, "init", "mine", "--example", "lowsnr")
     copied, original = (

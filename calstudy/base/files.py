@@ -63,7 +63,7 @@ def rounded(values: Iterable[float]) -> list[float | None]:
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a stream whose content replaces `path` when the block ends without error."""
-    partial_file = path.with_name(f".{path.name}-{uuid4().hex}")
+    partial_file = path.with_name(f".{path.name[:100]}-{uuid4().hex}")
     try:
         with partial_file.open("xb") as stream:
             yield stream
@@ -75,6 +75,10 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file completely or not at all."""
-    with replacing(path) as stream:
+    """Write a text file completely or not at all; what is no file, such as a pipe, is written as it is."""
+    target = path.resolve()
+    if target.exists() and not target.is_file():
+        target.write_text(text, encoding="utf-8")
+        return
+    with replacing(target) as stream:
         stream.write(text.encode())

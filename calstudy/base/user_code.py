@@ -260,13 +260,13 @@ class UserCodeError(InputError):
 
 
 @contextmanager
-def user_code(name: str = "") -> Iterator[None]:
+def user_code(name: str = "", disk_passes: bool = False) -> Iterator[None]:
     """Run a user's code; its errors, SystemExit included, become a `UserCodeError` that names the line, or else `name`.
 
     `InputError` passes: it is how user code refuses its input. So do errors without a line of user code, which are
     defects of calstudy, except where the call itself does not fit the user's function. KeyboardInterrupt passes in the
     main thread, where it is Ctrl-C. Without a `name` the code may be anybody's: lines are then those of plug-ins in
-    files alone, and what the file system refuses passes.
+    files alone. With `disk_passes` so does what the file system refuses.
     """
     try:
         yield
@@ -275,7 +275,7 @@ def user_code(name: str = "") -> Iterator[None]:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt) and current_thread() is main_thread():
             raise
-        if not name and isinstance(error, OSError | RuntimeError) and refusal_of_disk(error):
+        if disk_passes and isinstance(error, OSError | RuntimeError) and refusal_of_disk(error):
             raise
         frames = [
             (frame.f_code, line)

@@ -2,7 +2,7 @@
 
 Worlds with labels such as ``positions: 2 cm`` and ``positions: 5 cm`` are severities of one fault: the text before the
 colon is its name, the number after it the severity. The first world without a colon is severity zero of all faults that
-have no world of severity zero themselves. Negative numbers, such as levels in dB, are no severities: zero would be more.
+have no world of severity zero themselves. Negative numbers, such as levels in dB, are no severities: zero is more.
 """
 
 from __future__ import annotations

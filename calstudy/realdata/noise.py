@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 MEDIAN_OVER_MEAN = np.log(2)
 ABOVE_NOISE = 2.0
 """Antennas with a baseline of more than so many times the median power of noise correlate with another."""
+PARALLEL = (-1, -2, -5, -6)
+"""Numbers of the polarizations RR, LL, XX and YY."""
 FAINT = 1e-3
 """Without autocorrelations baselines with a smaller fraction of the array's median power are noise."""
 TYPICAL_PARTNERS = 4
@@ -92,6 +94,9 @@ def uncorrelated(data: UVData) -> list[int]:
     crosses = np.not_equal(*pairs.T)
     pairs, values = pairs[crosses], np.abs(np.where(flag_cube(data), 0, to_cube(data))[:, crosses]) ** 2
     seen = np.asarray(np.any(values > 0, axis=(0, 2)))
+    # Cross-hands have little of the sky, of which antennas are known that see none.
+    parallel = np.isin(data.polarization_array, PARALLEL)
+    seen &= parallel | ~parallel.any()
     for polarization in range(data.Npols):
         variance = radiometer_variance(data, pairs, polarization)
         known = np.ma.masked_less_equal(np.nan_to_num(values[..., polarization]), 0)

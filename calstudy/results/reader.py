@@ -291,6 +291,8 @@ class _Manifest(BaseModel):
     """What is read of a manifest; it has more, and those of earlier versions have less."""
 
     name: str
+    finished: str | None = None
+    points: list[dict[str, Any]] = []
     products: list[dict[str, Any]] = []
     tables: list[str] = []
     captions: dict[str, str] = {}

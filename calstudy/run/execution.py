@@ -201,7 +201,8 @@ def _make(order: WorkOrder, store: Store) -> Product:
     logging.captureWarnings(True)
     with store.building(task.stage.name, order.key) as folder:
         # Most products of matrices are many and small: threads in each cost more than they gain.
-        with Usage() as usage, _warnings() as found, threadpool_limits(limits=1, user_api="blas"), user_code():
+        one_thread, users = threadpool_limits(limits=1, user_api="blas"), user_code(disk_passes=True)
+        with Usage() as usage, _warnings() as found, one_thread, users:
             notes = task.given({name: product.path for name, product in inputs.items()}).make(folder)
         if found:
             notes = {**notes, "warnings": [*notes.get("warnings", ()), *dict.fromkeys(found)]}

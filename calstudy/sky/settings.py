@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import default_directory
@@ -148,6 +149,19 @@ class FileSources(PointSources):
         return self
 
 
+def _with_absolute_files(value: Any, folder: Path) -> Any:
+    """Return options with absolute paths in place of the names of files in a folder; other texts have no suffix."""
+    if isinstance(value, dict):
+        return {name: _with_absolute_files(item, folder) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_with_absolute_files(item, folder) for item in value]
+    if not isinstance(value, str) or not Path(value).suffix:
+        return value
+    path = os.path.join(folder, os.path.expanduser(value))  # noqa: PTH111, PTH118
+    # Of a name that is too long, Path.is_file raises OSError.
+    return os.path.abspath(path) if os.path.isfile(path) else value  # noqa: PTH100, PTH113
+
+
 class CodeSources(Section):
     """Sources from a user's function.
 
@@ -160,9 +174,16 @@ class CodeSources(Section):
     function: str = Field(description="Name of the function in it.")
     options: dict[str, Any] = Field(
         default_factory=dict,
-        description="Given to the function as keyword arguments. Files that they name are known by their content.",
+        description="Given to the function as keyword arguments. Names of files start at the experiment file, and "
+        "count by their content.",
         json_schema_extra=NAMES_FILES,
     )
+
+    @field_validator("options")
+    @classmethod
+    def _files_of_options(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        folder = folder_of_files(info)
+        return value if folder is None else _with_absolute_files(value, folder)
 
     @model_validator(mode="after")
     def _function_is_there(self, info: ValidationInfo) -> CodeSources:

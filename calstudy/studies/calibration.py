@@ -222,7 +222,7 @@ class DataCalibration(DataStudy):
         """Raise InputError if a result would replace a file that is read."""
         also = (Path(GAINS).with_suffix(SUFFIXES[kind]).name for kind in self.file.also)
         for name in (GAINS, MODEL, RESIDUAL, SOLUTION, *also):
-            if (self.outputs.runs / name).resolve() in self._inputs:
+            if self.outputs.runs.resolve() / name in self._inputs:
                 raise InputError(
                     f"output = {self.outputs.runs}: {name} in it is an input, and a result would replace it; choose "
                     "another folder"

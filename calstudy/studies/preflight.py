@@ -155,12 +155,16 @@ def notes_of(experiment: Experiment) -> tuple[str, ...]:
 
 def _absent_sources(experiment: Experiment) -> str:
     true, assumed = (world.sky.foregrounds for world in (experiment, assumed_world(experiment)))
-    there, given = (getattr(foregrounds, "count", None) or 0 for foregrounds in (true, assumed))
-    if not 0 < there < given or true.with_defaults("count") != assumed.with_defaults("count"):
+    if not (isinstance(true, PointSources) and isinstance(assumed, PointSources)):
+        return ""
+    there = _kept(true, experiment.instrument.channels)
+    given = math.inf if assumed.count is None else _kept_of_assumed(experiment)
+    same = true.with_defaults("count", "errors") == assumed.with_defaults("count", "errors")
+    if not same or there is None or given is None or true.count is None or given <= there:
         return ""
     return (
-        f"{FIELD}.sky.foregrounds.count = {given}: the sky has {there} sources, and the sky model of the calibrator "
-        f"{given - there} that are not there; to leave out some, give a smaller number"
+        f"{FIELD}.sky.foregrounds.count = {assumed.count or 'null'}: the sky has {there} sources, and the sky model of "
+        "the calibrator some that are not there; to leave out some, give a smaller number"
     )
 
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 
 from rich.console import Console
 
-from calstudy.base.errors import InputError, errors_of_files
+from calstudy.base.errors import InputError, refusal_of_disk
 from calstudy.base.files import digest_json, write_text
 from calstudy.base.identity import identity
 from calstudy.base.paths import texts
@@ -367,14 +367,24 @@ def run_study(study: Study, budget: Budget | None = None, console: Console | Non
         return _filled(study, made)
 
 
+def _explain(error: OSError, study: Study) -> None:
+    """Raise InputError if a product was removed, or the folder of runs cannot be written; other errors are not ours."""
+    named = Path(error.filename).resolve() if isinstance(error.filename, str) else None
+    if named is not None and named.is_relative_to(study.outputs.store.expanduser().resolve()):
+        if isinstance(error, FileNotFoundError):
+            missing = f"{error.filename}: was removed while the results were written"
+            raise InputError(f"{missing}; run again, which makes what is missing") from None
+    elif (reason := refusal_of_disk(error)) and (named is None or named.is_relative_to(study.folder)):
+        raise InputError(f"outputs.runs: {study.folder} cannot be written ({reason})") from None
+
+
 def _filled(study: Study, made: RunProducts) -> Run:
     parts = {name: _filled(part, made) for name, part in study.parts.items()}
     own = made.subset(study.tasks)
-    with errors_of_files(f"outputs.runs = {str(study.outputs.runs)!r}: {study.folder.name} cannot be written"):
-        try:
-            study.write_results(own)
-        except FileNotFoundError as error:
-            missing = f"{error.filename}: was removed while the results were written"
-            raise InputError(f"{missing}; run again, which makes what is missing") from None
+    try:
+        study.write_results(own)
         write_report(study.folder)
+    except OSError as error:
+        _explain(error, study)
+        raise
     return Run(study.folder, own, tuple(study.tasks), parts)

@@ -198,6 +198,13 @@ def test_an_antenna_of_noise_is_named_without_autocorrelations_as_well(clean):
     # Of an amplifier whose antenna is not connected: 2 % of the noise of the others.
     data.data_array[dead] *= 1e-3
     assert uncorrelated(data) == [12]
+    # Cross-hands of noise in all antennas say nothing.
+    crossed = clean.copy()
+    crossed.polarization_array = np.array([-7])
+    crossed.data_array[:] = 1e-3 * np.random.default_rng(3).normal(size=crossed.data_array.shape)
+    both = data.copy()
+    both.fast_concat(crossed, "polarization", inplace=True)
+    assert uncorrelated(both) == [12]
     # Antennas that differ in gain by ten see the sky.
     data.data_array[dead] = clean.data_array[dead] / 10
     assert uncorrelated(data) == []

@@ -287,6 +287,10 @@ def test_a_flux_limit_that_misses_nothing_of_a_catalogue_is_refused_in_a_plan(tm
             "calibration.assumed={sky.foregrounds.count: 150}",
             "calibration.assumed.sky.foregrounds.count = 150: the sky has 100 sources, and the sky model of the",
         ),
+        (
+            "calibration.assumed={sky.foregrounds.count: null}",
+            "calibration.assumed.sky.foregrounds.count = null: the sky has 100 sources, and the sky model of the",
+        ),
     ],
 )
 def test_settings_that_cannot_be_met_are_noted_in_a_plan(change, told, tmp_path, capsys, monkeypatch):

@@ -351,13 +351,15 @@ def test_a_product_of_a_module_beside_a_file_counts_with_its_content(tmp_path):
     assert keys[0] != keys[1]
 
 
-def test_a_file_that_an_option_of_a_sky_names_counts_by_its_content(tmp_path):
+@pytest.mark.parametrize("place", ["absolute", "beside the experiment"])
+def test_a_file_that_an_option_of_a_sky_names_counts_by_its_content(tmp_path, place):
+    name = str(tmp_path / "flux.txt") if place == "absolute" else "flux.txt"
     (tmp_path / "sky.py").write_text("def sky(frequencies, data, names):\n    return None\n")
-    options = {"data": {"flux": str(tmp_path / "flux.txt")}, "names": ["no such file", 3]}
+    options = {"data": {"flux": name}, "names": ["no such file.txt", 3]}
     foregrounds = {"kind": "code", "path": "sky.py", "function": "sky", "options": options}
     found = []
     for text in ("10", "99"):
         (tmp_path / "flux.txt").write_text(text)
         found.append(identity(validate(override(tiny(tmp_path), "sky.foregrounds", foregrounds), tmp_path).sky))
     assert found[0] != found[1]
-    assert found[0]["foregrounds"]["options"]["names"] == ["no such file", 3]
+    assert found[0]["foregrounds"]["options"]["names"] == ["no such file.txt", 3]
