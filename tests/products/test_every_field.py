@@ -108,9 +108,11 @@ UNKEYED = {
     ("GainFit", "models_at_once"),
     ("ByFile", "salt"),
     (Step.__name__, "scale"),
+    ("Folders", "store"),
+    ("Folders", "runs"),
 }
-"""How results are made; `chunks` is in the keys of the pieces, a salt finds files that count by their content, and the
-scale of a step is in its experiments."""
+"""How results are made. `chunks` is in the keys of the pieces, a salt finds files that count by their content, the
+scale of a step is in its experiments, and results do not depend on the folders of products and runs."""
 
 
 def keys(data: dict[str, Any]) -> set[str]:
