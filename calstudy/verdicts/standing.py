@@ -210,6 +210,8 @@ class InBand:
         decisive = self.decisive
         if self.standing == "passes":
             return f"passes: {self.numbers}"
+        if len(self.worlds) > 1 and all(world.refused for world in self.worlds):
+            return "cannot work in any world"
         if self.standing == "fails":
             more = f" and {len(decisive) - NAMED} more" if len(decisive) > NAMED else ""
             return f"fails in {', '.join(world.reason for world in decisive[:NAMED])}{more}"

@@ -120,6 +120,9 @@ def test_what_is_no_solution_fails_though_its_bias_is_small():
 def test_a_calibrator_that_cannot_work_in_a_world_fails_there():
     found = standing_of(case(0.0, 0.01), None, refusals=[("sources missing", "name", "no redundant baselines")])
     assert str(found) == "fails in sources missing (cannot work)"
+    found = {"name": case(0.0, 0.01)}
+    (_, nowhere) = standings({"a": found, "b": found}, [(world, "other", "why") for world in "ab"])
+    assert (nowhere.standing, str(nowhere)) == ("fails", "cannot work in any world")
 
 
 def test_a_limit_of_ones_own_changes_the_answer():
