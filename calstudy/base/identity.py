@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from calstudy.base.paths import mapped
 from calstudy.base.plugins import Plugin
 from calstudy.base.schema import NAMES_FILES, REVISED, defaults
 from calstudy.base.user_code import digest_file, identity_of_file
@@ -38,12 +39,8 @@ def _identity_of_folder(folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): f"sha256:{digest_file(path)}" for path in files}
 
 
-def _with_files(value: Any) -> Any:
-    """Return a block with paths in place of texts that are absolute paths of existing files."""
-    if isinstance(value, Mapping):
-        return {name: _with_files(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_with_files(item) for item in value]
+def _as_file(value: Any) -> Any:
+    """Return the path that a text is, if it is the absolute one of an existing file, or else the value."""
     # Of a name that is too long, Path.is_file raises OSError.
     named = isinstance(value, str) and Path(value).is_absolute() and os.path.isfile(value)  # noqa: PTH113
     return Path(value) if named else value
@@ -59,7 +56,7 @@ def _identity_of_section(section: BaseModel) -> dict[str, Any]:
         elif isinstance(extra, dict) and extra.get("keyed") is False:
             continue
         elif value != default or (isinstance(value, Path) and value.exists()):
-            content = identity(_with_files(value) if extra == NAMES_FILES else value)
+            content = identity(mapped(value, _as_file) if extra == NAMES_FILES else value)
             # A block with the identity of the default is left out as well.
             if not (type(value) is type(default) and isinstance(value, BaseModel) and content == identity(default)):
                 version = extra.get(REVISED) if isinstance(extra, dict) else None

@@ -107,3 +107,10 @@ def texts(value: Any, below: Collection[str] = ()) -> Iterator[str]:
     elif isinstance(value, list | tuple):
         for item in value:
             yield from texts(item, below)
+
+
+def mapped(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Return a content in which everything but mappings and lists is changed by a function."""
+    if isinstance(value, Mapping):
+        return {name: mapped(item, change) for name, item in value.items()}
+    return [mapped(item, change) for item in value] if isinstance(value, list | tuple) else change(value)

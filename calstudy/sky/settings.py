@@ -11,6 +11,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import default_directory
+from calstudy.base.paths import mapped
 from calstudy.base.schema import NAMES_FILES, Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 from calstudy.base.user_code import load_function
@@ -149,12 +150,8 @@ class FileSources(PointSources):
         return self
 
 
-def _with_absolute_files(value: Any, folder: Path) -> Any:
-    """Return options with absolute paths in place of the names of files in a folder; other texts have no suffix."""
-    if isinstance(value, dict):
-        return {name: _with_absolute_files(item, folder) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_with_absolute_files(item, folder) for item in value]
+def _absolute(value: Any, folder: Path) -> Any:
+    """Return the absolute path of a text that names a file in a folder, with a suffix, or else the value."""
     if not isinstance(value, str) or not Path(value).suffix:
         return value
     path = os.path.join(folder, os.path.expanduser(value))  # noqa: PTH111, PTH118
@@ -183,7 +180,7 @@ class CodeSources(Section):
     @classmethod
     def _files_of_options(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         folder = folder_of_files(info)
-        return value if folder is None else _with_absolute_files(value, folder)
+        return value if folder is None else mapped(value, lambda text: _absolute(text, folder))
 
     @model_validator(mode="after")
     def _function_is_there(self, info: ValidationInfo) -> CodeSources:
