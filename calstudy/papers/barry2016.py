@@ -25,6 +25,9 @@ REALISTIC = (0.01, 0.2)
 """Fraction of the rms of the foregrounds that a catalogue of realistic completeness lacks; one of all sources above 0.1
 Jy lacks 0.07."""
 MISSING = Source("Abstract", ("incomplete_sky_model",))
+COMPLETE = ("complete_sky_model", "structured_complete")
+STRUCTURED = ("structured_antennas", "structured_complete")
+"""Roles of runs with the true sky as model, and of antennas with structure at the delays of the window."""
 JOINT = "the precision of the catalogue and the spectral smoothness of the antennas constrain each other"
 
 
@@ -85,6 +88,18 @@ def structured_antennas_contaminate_window(run: Results) -> Finding:
     return _bias(run)
 
 
+@MISSING.states(
+    f"{JOINT}: antennas with such structure can be calibrated if the model is unrealistically accurate",
+    "s² P^R0 / P^S outside the wedge, k of 0.2 to 0.5 h/Mpc, with the complete sky model and antennas with such "
+    "structure",
+    AtMost(1, sigmas=2),
+    "less than the EoR itself, so that it can be measured",
+    roles=("structured_complete",),
+)
+def complete_model_calibrates_structured_antennas(run: Results) -> Finding:
+    return _bias(run, incomplete=False)
+
+
 class Barry2016(Paper):
     """Statements on sky-based calibration with complete and incomplete sky models."""
 
@@ -100,12 +115,15 @@ class Barry2016(Paper):
         "gains are smooth in frequency, with a sky model that lacks sources",
         "structured_antennas": "such a run of antennas with structure at the delays of the window, with inverse "
         "variances as weights",
+        "structured_complete": "a run of sky-based calibration, channel by channel, of such antennas, "
+        "with the true sky as its model and inverse variances as weights",
     }
     usual_members: ClassVar[Mapping[str, str]] = {
         "complete_sky_model": "long-sky-based",
         "incomplete_sky_model": "long-sky-based-incomplete",
         "smooth_antennas": "long-smoothed-incomplete",
         "structured_antennas": "long-smoothed-reflections",
+        "structured_complete": "long-reflections",
     }
 
     def refusal(self, role: str, experiment: Experiment) -> str | None:
@@ -113,8 +131,8 @@ class Barry2016(Paper):
             experiment,
             ("sky-based", "skycal"),
             _other_smoothing(experiment, smoothed=role in ("smooth_antennas", "structured_antennas")),
-            _no_structure(experiment) if role == "structured_antennas" else structured_gains(experiment),
-            incomplete=role != "complete_sky_model",
+            _no_structure(experiment) if role in STRUCTURED else structured_gains(experiment),
+            incomplete=role not in COMPLETE,
         )
 
 
