@@ -48,7 +48,15 @@ from calstudy.products.files import (
 from calstudy.products.gain_errors import ERRORS
 from calstudy.products.gain_errors import gain_errors as errors_of_gains
 from calstudy.report.headline import read_headline
-from calstudy.results.reader import EXPERIMENT, RunFolder, by_length_and_delay, by_wavenumber, gain_errors
+from calstudy.results.reader import (
+    EXPERIMENT,
+    RunFolder,
+    Tables,
+    by_length_and_delay,
+    by_wavenumber,
+    gain_errors,
+    undamaged,
+)
 from calstudy.run.execution import Budget
 from calstudy.run.store import Store
 from calstudy.run.task import Task
@@ -72,6 +80,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 Half = Literal["even", "odd"]
 REGIONS = ("outside-wedge", "inside-wedge")
+ONE_T = "transfer function of one calibration"
 SMOOTHING = ("smooth_gains", "gain_delay", "smoothness")
 """Fields of calibrators that make gains smooth."""
 
@@ -356,24 +365,25 @@ class OpenRun:
     @property
     def transfer(self) -> xarray.Dataset:
         """The transfer function T of the calibration against `region` ("outside-wedge", "inside-wedge") and `k`."""
-        return self._by_region(self._folder.tables.transfer)
+        return self._by_region(self._of_variants(ONE_T).transfer)
 
     @property
     def transfer_in_bands(self) -> xarray.Dataset:
         """The same in four wide bands of k."""
-        return self._by_region(self._folder.tables.transfer_in_bands)
+        return self._by_region(self._of_variants(ONE_T).transfer_in_bands)
 
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        return by_length_and_delay(self._folder.tables.transfer_map())
+        return by_length_and_delay(self._of_variants(ONE_T).transfer_map())
 
     @property
     def scores(self) -> pandas.DataFrame:
         """T and bias of the calibration in bands of k, with errors from leaving out antennas; one row for each band."""
         import pandas
 
-        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in self._folder.tables.summary["bands"]]
+        bands = self._of_variants("scores of one calibration").summary["bands"]
+        rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in bands]
         return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
 
     def standings(self, limit: float = LIMIT, worlds: Sequence[str] | None = None) -> pandas.DataFrame:
@@ -425,14 +435,9 @@ class OpenRun:
 
     def table(self, name: str) -> pandas.DataFrame:
         """Return a table of the run, such as "comparison" or "eor.outside-wedge"."""
-        import pandas
-
         listed = f"{nearest(name, self.tables)} (there are: {', '.join(self.tables)})"
         path = self._folder.tables.path(f"{name}.csv", f"the run has no table {name!r}{listed}")
-        # A line above the header describes the sky model; cells may have the sign as well.
-        with path.open(encoding="utf-8") as file:
-            is_described = file.readline().startswith("# ")
-        return pandas.read_csv(path, skiprows=int(is_described))
+        return undamaged(path, _read_table)
 
     @property
     def parts(self) -> dict[str, OpenRun]:
@@ -504,24 +509,22 @@ class OpenRun:
         try:
             return load_study(self.folder / EXPERIMENT)
         except ExperimentError as error:
-            # The version that wrote the file accepted it.
-            commit = self._folder.manifest.get("git_commit")
-            writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
-            raise InputError(
-                f"{self.folder / EXPERIMENT}: written on {self._folder.finished:%d %B %Y} by {writer}; this version "
-                f"refuses it, so run the experiment again, or read the run with that version ({error})"
-            ) from None
+            raise self._folder.not_readable(error) from None
 
     @property
     def _experiment(self) -> ExperimentStudy:
         return _single(self._study)
 
-    def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
-        if not (names := self._folder.tables.variants):
+    def _of_variants(self, wanted: str) -> Tables:
+        """Return the tables of a run of one experiment; raises InputError, with where what is wanted is, of others."""
+        tables = self._folder.tables
+        if not tables.variants:
             has_tables = "its numbers are in its tables" if self.tables else "run the experiment again"
-            remedy = "take one of its parts" if self.parts else has_tables
-            raise InputError(f"{self.name}: has no spectra by variant; {remedy}")
-        return ByVariant(names, read)
+            raise InputError(f"{self.name}: has no {wanted}; {'take one of its parts' if self.parts else has_tables}")
+        return tables
+
+    def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
+        return ByVariant(self._of_variants("spectra by variant").variants, read)
 
     def _spherical(self, modes: str) -> ByVariant:
         return self._by_variant(lambda name: by_wavenumber(self._folder.tables.spherical(name, modes)))
@@ -574,6 +577,16 @@ class OpenRun:
         # A point is deeper in the folder of runs, which may also have been renamed.
         started = next((folder for folder in above if folder / runs in above), above[len(runs.parts)])
         return [Store(store), Store(started / store)]
+
+
+def _read_table(path: Path) -> pandas.DataFrame:
+    import pandas
+
+    text = path.read_text(encoding="utf-8")
+    if not text.endswith("\n"):
+        raise ValueError("the end is missing")
+    # A line above the header describes the sky model; cells may have the sign as well.
+    return pandas.read_csv(StringIO(text), skiprows=int(text.startswith("# ")))
 
 
 def _overrides(changes: Mapping[str, Any], section: str = "") -> list[str]:

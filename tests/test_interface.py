@@ -333,7 +333,12 @@ def test_damaged_tables_are_named_with_the_remedy(run, tmp_path):
     for path in (tmp_path / "run" / "tables").iterdir():
         path.write_text("junk")
     damaged = calstudy.open_run(tmp_path / "run")
-    for read in (lambda: damaged.scores, lambda: damaged.transfer, lambda: damaged.spectra["eor"]):
+    for read in (
+        lambda: damaged.scores,
+        lambda: damaged.transfer,
+        lambda: damaged.spectra["eor"],
+        lambda: damaged.table("eor.outside-wedge"),
+    ):
         with pytest.raises(InputError, match="is damaged; run the experiment again"):
             read()
     with pytest.raises(InputError, match=r"tables\.json: is damaged"):
@@ -343,6 +348,15 @@ def test_damaged_tables_are_named_with_the_remedy(run, tmp_path):
         _ = calstudy.open_run(tmp_path / "run").scores
     shutil.rmtree(damaged.folder / "tables")
     assert damaged.tables == []
+
+
+@pytest.mark.parametrize("part", [0, 0.5])
+def test_a_table_that_is_cut_is_damaged(run, tmp_path, part):
+    shutil.copytree(run.folder, tmp_path / "run")
+    table = tmp_path / "run" / "tables" / "eor.outside-wedge.csv"
+    table.write_text(table.read_text()[: int(part * table.stat().st_size)])
+    with pytest.raises(InputError, match=r"eor\.outside-wedge\.csv: is damaged"):
+        calstudy.open_run(tmp_path / "run").table("eor.outside-wedge")
 
 
 def test_a_run_of_an_older_version_says_so(run, tmp_path):
@@ -357,6 +371,8 @@ def test_a_run_of_an_older_version_says_so(run, tmp_path):
     (tmp_path / "experiment.yaml").write_text(older, encoding="utf-8")
     with pytest.raises(InputError, match=r"written on .* by .*; this version refuses it.*\(calibration.skip_flagged"):
         calstudy.open_run(tmp_path).gains("residual")
+    with pytest.raises(InputError, match=r"experiment\.yaml: written on .* by .*; this version refuses it"):
+        RunFolder(tmp_path).experiment()
 
 
 def test_a_line_above_the_header_of_a_table_is_no_header(tmp_path):

@@ -219,10 +219,11 @@ def require_valid(made: Layout, origin: str) -> None:
         raise InputError(f"{origin}: antenna numbers (>= 0) and names must be unique; see '{bad[0]}'")
     if not np.isfinite(made.enu).all():
         raise InputError(f"{origin}: positions must be finite")
-    if np.abs(made.enu).max() > FARTHEST or (count > 2 and np.ptp(made.enu, axis=0).max() < SMALLEST):
+    width = np.ptp(made.enu, axis=0).max()
+    if np.abs(made.enu).max() > FARTHEST or (count > 2 and RESOLVED < width < SMALLEST):
         raise InputError(
             f"{origin}: antennas are up to {np.abs(made.enu).max():.4g} m from the origin, and the array is "
-            f"{np.ptp(made.enu, axis=0).max():.4g} m wide; give east, north and up of a place in the array, in metres, "
+            f"{width:.4g} m wide; give east, north and up of a place in the array, in metres, "
             "not in kilometres or from the centre of the Earth"
         )
     if "" in names:

@@ -28,11 +28,11 @@ The prior that fixes s (in the paper, on the summed model) has an error of some 
 1/s, hence C by 1/s and T by 1/s^2, which is a part of P^R / P^S but not a loss. In a simulation the true gains are
 known, and with them
 
-    s^-2 = Re < r_even* r_odd >,   r = g_a g_b* / (ghat_a ghat_b*) averaged over the integrations,
+    s^-2 = Re < r_even* r_odd >,   r = g_a g_b* / (ghat_a ghat_b*) averaged over the integrations of a block,
 
-the mean over baselines and channels weighted by the square of the taper: calibration with these gains multiplies the
-power of a white signal by that. T s^2 is the transfer function free of the flux scale. Where the true gains are not
-known, the *squared coherence* of response and signal,
+the mean over baselines, blocks of coherent averaging, and channels, weighted by the square of the taper: calibration
+with these gains multiplies the power of a white signal by that. T s^2 is the transfer function free of the flux scale.
+Where the true gains are not known, the *squared coherence* of response and signal,
 
     C^2 / T = (Re <S* D>)^2 / (<S* S> <D* D>),
 

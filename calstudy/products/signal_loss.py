@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table
@@ -104,6 +105,7 @@ def _flux_scale(graph: Graph) -> Task:
         "flux scale",
         taper=graph.experiment.power.taper,
         polarizations=len(graph.experiment.instrument.polarizations),
+        blocks=blocks_in([spectra.average(graph, residual, parity) for parity in PARITIES]),
         even=even,
         odd=odd,
         gains=corruption.gains(graph) if residual.effects else None,
@@ -312,10 +314,11 @@ class SweepSummary(Task, stage="sweep-summary", version=3):
 
 
 class FluxScale(Task, stage="flux-scale", version=1):
-    """The flux scale of a calibration, of all polarizations, as are the spectra that it multiplies."""
+    """The flux scale of a calibration, of all polarizations and blocks, as are the spectra that it multiplies."""
 
     taper: str
     polarizations: int = 1
+    blocks: int = 1
     even: Input
     odd: Input
     gains: Input = None
@@ -331,12 +334,18 @@ class FluxScale(Task, stage="flux-scale", version=1):
         return {}
 
     def _ratio(self, calibration: Path, polarization: int) -> np.ndarray:
-        """Return true over fitted gain products of one polarization, (Npairs, Nfreqs)."""
+        """Return true over fitted gain products of one polarization, (Nblocks Npairs, Nfreqs)."""
+        from calstudy.power.average import divide
         from calstudy.products.selection import read_gains, true_of
 
         fitted = read_gains(calibration, polarization)
         true = true_of(self.gains, fitted, polarization)
-        return gain_ratio(true, np.where(fitted.flags, np.nan, fitted.values))
+        values = np.where(fitted.flags, np.nan, fitted.values)
+        if self.blocks == 1 or fitted.times is None:
+            return gain_ratio(true, values)
+        integration = float(np.median(np.diff(fitted.times))) * SECONDS_PER_DAY
+        blocks = divide(fitted.times, integration, self.blocks)
+        return np.concatenate([gain_ratio(true[block.times], values[block.times]) for block in blocks])
 
     def _cost(self) -> Cost:
         return Cost(0.1 + size_of(self).samples * 6e-8, disk=1e3)

@@ -100,7 +100,10 @@ class Quality:
         ]
         level = _median(self.chi2_by_antenna)
         if level < ABSORBED:
-            found.append(f"chi^2 is {level:.1g} per sample: the fit has about as many unknowns as there are samples")
+            found.append(
+                f"chi^2 is {level:.1g} per sample: the fit has about as many unknowns as there are samples, or the "
+                f"noise is far below that of the {self.noise}"
+            )
         compared = (
             (channels, self.chi2_by_channel),
             (antennas, self.chi2_by_antenna),

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from calstudy.base.errors import InputError
+from calstudy.base.errors import ExperimentError, InputError
 from calstudy.base.gains import read_gain_errors
 from calstudy.base.kept_arrays import DAMAGE, read_arrays
 from calstudy.base.table import Table, from_json
@@ -68,7 +68,7 @@ NO_TRANSFER = "the run does not calibrate the same data with the EoR and without
 AGAIN = "run the experiment again"
 
 
-def _undamaged(path: Path, read: Callable[[Path], Read], remedy: str = AGAIN) -> Read:
+def undamaged(path: Path, read: Callable[[Path], Read], remedy: str = AGAIN) -> Read:
     """Read a file of a run; raises InputError, with what can be done, if its content is not that of a run."""
     try:
         return read(path)
@@ -131,7 +131,7 @@ class Tables:
                 raise ValueError("not a score")
             return found
 
-        return _undamaged(self.path(SCORE, NO_SCORES), read)
+        return undamaged(self.path(SCORE, NO_SCORES), read)
 
     def measured(self, name: str) -> Statistic:
         """Return a comparison of the calibration with the truth (`calstudy.calibrate.agreement`)."""
@@ -144,7 +144,7 @@ class Tables:
     def agreement(self) -> Mapping[str, Any]:
         """The content of agreement.json."""
         missing = "the run has no calibrated variant 'residual' of foregrounds and noise to compare"
-        return _undamaged(self.path(AGREEMENT, missing), read_json)
+        return undamaged(self.path(AGREEMENT, missing), read_json)
 
     @property
     def variants(self) -> list[str]:
@@ -168,7 +168,7 @@ class Tables:
         return self._loaded(spectrum_file(variant, kind), f"the run has no variant {variant!r}", cls)
 
     def _loaded(self, name: str, missing: str, kind: type[Stored]) -> Stored:
-        return _undamaged(self.path(name, missing), lambda found: load_spectrum(found, kind))
+        return undamaged(self.path(name, missing), lambda found: load_spectrum(found, kind))
 
 
 @dataclass(frozen=True)
@@ -376,7 +376,19 @@ class RunFolder:
 
     def experiment(self, without: Sequence[str] = ()) -> Experiment:
         """Return the validated experiment of a run of one experiment, without some of its sections."""
-        return validate({key: value for key, value in self.content.items() if key not in without}, self.path)
+        try:
+            return validate({key: value for key, value in self.content.items() if key not in without}, self.path)
+        except ExperimentError as error:
+            raise self.not_readable(error) from None
+
+    def not_readable(self, error: ExperimentError) -> InputError:
+        """Return the error that experiment.yaml, which the version that wrote it accepted, is refused."""
+        commit = self.manifest.get("git_commit")
+        writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
+        return InputError(
+            f"{self.path / EXPERIMENT}: written on {self.finished:%d %B %Y} by {writer}; this version refuses it, so "
+            f"run the experiment again, or read the run with that version ({error})"
+        )
 
     @property
     def tables(self) -> Tables:
@@ -403,7 +415,7 @@ class RunFolder:
     def shown(self) -> list[Table]:
         """The tables of a report that were made with the products; none in runs of earlier versions."""
         path = self.path / "tables" / SHOWN
-        return _undamaged(path, lambda file: from_json(file.read_text(encoding="utf-8"))) if path.is_file() else []
+        return undamaged(path, lambda file: from_json(file.read_text(encoding="utf-8"))) if path.is_file() else []
 
     @property
     def figures(self) -> Path:
@@ -435,7 +447,7 @@ class RunFolder:
             standings(scores)
             return scores
 
-        return _undamaged(path, read, "run the comparison again") if path.is_file() else {}
+        return undamaged(path, read, "run the comparison again") if path.is_file() else {}
 
     @property
     def has_claims(self) -> bool:
@@ -451,7 +463,7 @@ class RunFolder:
         """Return the verdicts of a JSON file; empty if it does not exist."""
         if not path.is_file():
             return []
-        return _undamaged(path, lambda file: verdicts_from_json(file.read_text(encoding="utf-8")), remedy)
+        return undamaged(path, lambda file: verdicts_from_json(file.read_text(encoding="utf-8")), remedy)
 
 
 def find_runs(folder: Path) -> list[RunFolder]:

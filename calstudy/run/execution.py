@@ -494,7 +494,7 @@ def execute(
             futures[future] = task
         return futures
 
-    with _client(workers) as client:
+    with _client(workers) as client, _end_announced(workers, warn):
         client.subscribe_topic(WAITS, lambda event: warn(event[1]))
         futures = ready(client)
         completed = as_completed(futures)
@@ -509,6 +509,17 @@ def execute(
             completed.update(started)
             done(task, product)
     return products
+
+
+@contextmanager
+def _end_announced(workers: Workers, warn: Callable[[str], None]) -> Iterator[None]:
+    """Say what an interrupted run waits for: a process ends at once, and a thread of this one when its work is done."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit):
+        if workers.count == 1 and workers.scheduler is None:
+            warn("the run ends when the product that it is making is finished")
+        raise
 
 
 def _result(future: Future, task: Task, client: Client, workers: Workers) -> Product:

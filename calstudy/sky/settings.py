@@ -12,7 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from calstudy.base.errors import InputError
 from calstudy.base.package_files import default_directory
 from calstudy.base.paths import mapped
-from calstudy.base.schema import NAMES_FILES, Section, choice, fault, folder_of_files
+from calstudy.base.schema import NAMES_FILES, REVISED, Section, choice, fault, folder_of_files
 from calstudy.base.units import Angle, FluxDensity, Fraction, Frequency, PowerDensity, Temperature
 from calstudy.base.user_code import load_function
 
@@ -137,7 +137,8 @@ class FileSources(PointSources):
     """A catalogue in a format that pyradiosky reads: SkyH5, VOTable (`votable`), FHD .sav, text; or a CSV (`csv`)."""
 
     kind: Literal["file"]
-    path: Path
+    # Polarized skies are received along the axes of the beams since 2.
+    path: Path = Field(json_schema_extra={REVISED: 2})
     votable: VotableColumns | None = Field(None, description="Required for a VOTable (.vot, .votable, .xml), ICRS.")
     csv: CsvColumns | None = Field(None, description="Required for a CSV (.csv).")
 
@@ -167,7 +168,10 @@ class CodeSources(Section):
     """
 
     kind: Literal["code"]
-    path: Path = Field(description="Python file; a relative path starts at the experiment file.")
+    # Polarized skies are received along the axes of the beams since 2.
+    path: Path = Field(
+        description="Python file; a relative path starts at the experiment file.", json_schema_extra={REVISED: 2}
+    )
     function: str = Field(description="Name of the function in it.")
     options: dict[str, Any] = Field(
         default_factory=dict,

@@ -21,6 +21,7 @@ from calstudy.corrupt.settings import CorruptionSettings
 from calstudy.experiment.files import override, validate
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.instrument.telescope import make_template
+from calstudy.power.delay import make_taper
 from calstudy.products import agreement, corruption, signal_loss
 from calstudy.products.files import AGREEMENT, read_json
 from calstudy.products.graph import Graph
@@ -314,3 +315,26 @@ def test_a_run_with_drifting_gains_is_compared_with_the_gains_of_each_integratio
     # EoR and noise are 1e-4 and 2e-4 of the data.
     assert found["gains_aligned"]["value"] < 1e-3
     assert read_json(products[1] / signal_loss.SCALE)["flux_scale"] == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_the_flux_scale_is_that_of_the_blocks_of_the_spectra(tmp_path, blocks):
+    """Gains that turn between blocks, and are not calibrated, cancel in an average of both, and not in either power."""
+    drift = {"kind": "random-walk", "amplitude": 0.4, "phase": "0.5 rad", "time": "10 s"}
+    data = override(tiny(tmp_path), "corruption.effects", [{"kind": "per-channel-gains", "drift": drift}])
+    data = override(data, "calibration", {"calibrator": "none"})
+    experiment = validate(data, tmp_path)
+    if blocks == 2:
+        duration = f"{experiment.instrument.times.integration} s"
+        experiment = validate(override(data, "power.coherent_time", duration), tmp_path)
+    graph = Graph(experiment)
+    tasks = [signal_loss._flux_scale(graph), corruption.gains(graph)]
+    products = [make([task], tmp_path)[task.key].path for task in tasks]
+    gains = read_gains(products[1]).values
+    first, second = np.triu_indices(gains.shape[1], 1)
+    ratios = gains[:, first] * gains[:, second].conj()
+    taper = make_taper(experiment.power.taper, gains.shape[2]) ** 2
+    of_blocks = np.abs(ratios if blocks == 2 else ratios.mean(axis=0)) ** 2
+    expected = (of_blocks @ taper).mean() / taper.sum()
+    assert read_json(products[0] / signal_loss.SCALE)["flux_scale"] == pytest.approx(expected**-0.5, rel=1e-6)

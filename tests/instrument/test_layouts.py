@@ -201,6 +201,7 @@ def test_positions_in_degrees_are_compared_with_the_site(tmp_path):
         ("e,east_m,n,u\n0,0,0,0\n1,1,1,1\n", "twice"),
         ("# HERA\ne n u\n0 0 0\n\n1 1\n", "line 5 of .* cells"),
         ("east_m,north_m,z\n0,0,0\n1,1,0\n", "missing: up_m; found: 2 rows of east_m, north_m, z"),
+        ("number,east_m,north_m,up_m\n", "found: 0 rows of number, east_m, north_m, up_m"),
         ("number,east_m,north_m,up_m\n1.5,0,0,0\n2,1,0,0\n", "line 2 of .* not a number .*'1.5'"),
         ("east_m,north_m,up_m\n0,0,0\n1,x,0\n", "line 3 of .* not a number .*'x'"),
         ("east_m,north_m,up_m\n0,0,0\n", "two rows"),

@@ -64,6 +64,7 @@ def test_it_decides_what_is_simulated(plugged):
         ("self.flat(np.eye(2))", "make returned None; a Layout is needed"),
         ("return self.flat(np.random.default_rng().normal(0, 30, (7, 2)))", "other antennas at every call"),
         ("return self.flat(np.array([[0, 0], [9, 0], [0, 1e-7]]))", "are in the same place"),
+        ("return self.flat(np.zeros((3, 2)))", "are in the same place"),
         ("return self.flat(np.array([[0, 0], [9, 9j]]))", "and enu one of real numbers"),
         ("return replace(self.flat(3 * np.eye(2)), numbers=np.array([0.0, 1.5]))", "must be an array of integers"),
         ("return replace(self.flat(3 * np.eye(2)), numbers=[0, 1])", "must be an array of integers"),

@@ -201,13 +201,15 @@ def test_sigterm_ends_a_run_as_an_interrupt_with_a_status_of_its_own(tmp_path):
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(tiny(tmp_path)))
     command = [sys.executable, "-m", "calstudy", "run", "study.yaml", "--workers", "1"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=environment) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=tmp_path, text=True, env=environment, **pipes) as process:
         while process.poll() is None and not list(tmp_path.glob("store/*/.building-*")):
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
-        _, message = process.communicate(timeout=120)
+        said, message = process.communicate(timeout=120)
     assert process.returncode == 143
     assert message.strip() == "calstudy: terminated; what is in the store is kept, and a run goes on from there"
+    assert "the run ends when the product that it is making is finished" in said
     [log] = tmp_path.glob(f"runs/*/{LOG}")
     assert "ended with status 143: SIGTERM" in log.read_text()
 

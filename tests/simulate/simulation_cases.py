@@ -39,11 +39,11 @@ def observe(count=5, channels=3, width="4 MHz", times=3, integration="56 s", pol
     return subset_template(template, template.time_array[:: template.Nbls], template.freq_array[:channels])
 
 
-def point_sky(coordinates, flux, spectral_index=None, stokes_q=0.0):
-    """Return points with the flux densities (Jy) at 180 MHz."""
+def point_sky(coordinates, flux, spectral_index=None, polarization=(0, 0, 0)):
+    """Return points with the flux densities (Jy) at 180 MHz, and Q, U and V as fractions of these."""
     count = len(flux)
     stokes = np.zeros((4, 1, count))
-    stokes[0, 0], stokes[1, 0] = flux, stokes_q
+    stokes[:, 0] = np.outer([1, *polarization], flux)
     spectrum = {"spectral_type": "flat"}
     if spectral_index is not None:
         spectrum = {

@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 from astropy import units
-from astropy.coordinates import SkyCoord
+from astropy.coordinates import AltAz, SkyCoord
+from astropy.time import Time
 from pydantic import ValidationError
 from pyradiosky import SkyModel
 from pyuvdata.analytic_beam import UniformBeam
@@ -204,12 +205,37 @@ def test_auto_takes_the_fastest_that_can(sky, template, tile_beam):
     auto = SimulationSettings().engine
     assert isinstance(auto, FastestEngine)
     assert auto.choose(sky, tile_beam, template).label == "dense"
-    polarized = point_sky(sky.skycoord[:2], [1.0, 1.0], stokes_q=0.3)
+    polarized = point_sky(sky.skycoord[:2], [1.0, 1.0], polarization=(0.3, 0, 0))
     assert auto.choose(polarized, tile_beam, template).label == "pyuvsim"
     expected = PyuvsimEngine().simulate(polarized, tile_beam, template)
     assert relative_error(auto.simulate(polarized, tile_beam, template), expected) < 1e-12
     with pytest.raises(InputError, match=r"simulation\.engine = 'dense': .*polarized sky"):
         simulate_with(DenseEngine(), polarized, tile_beam, template)
+
+
+@pytest.mark.parametrize("azimuth", [0.3, 1.9, 3.5, 5.1])
+@pytest.mark.parametrize("altitude", [1.5, 0.6])
+@pytest.mark.parametrize("fractions", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0.2, -0.3, 0.4)])
+def test_a_polarized_source_is_received_along_its_own_field(dipole_beam, altitude, azimuth, fractions):
+    """<E_N E_N*> = (I + Q) / 2, <E_E E_E*> = (I - Q) / 2, <E_N E_E*> = (U + iV) / 2 (IAU), on dipoles along x and y."""
+    template = observe(count=2, channels=1, times=1)
+    template.polarization_array = np.array([-5, -7])  # xx and xy
+    place = local_coordinates(template, np.array([altitude]), np.array([azimuth]))
+    plain = PyuvsimEngine().simulate(point_sky(place, [2.0]), dipole_beam, template)
+    found = PyuvsimEngine().simulate(point_sky(place, [2.0], polarization=fractions), dipole_beam, template)
+    found = found[0, 0, 0] * (plain[0, 0, 0, 0] / abs(plain[0, 0, 0, 0])).conj()
+
+    frame = AltAz(obstime=Time(template.time_array[0], format="jd"), location=template.telescope.location)
+    # From north, east and up to east, north and up.
+    pole, source = (at.transform_to(frame).cartesian.xyz.value[[1, 0, 2]] for at in (SkyCoord("0h +90d"), place[0]))
+    east = np.cross(pole, source)
+    east /= np.linalg.norm(east)
+    north = np.cross(source, east)
+    q, u, v = fractions
+    fields = np.stack([north, east])[:, :2]
+    received = fields.T @ np.array([[1 + q, u + 1j * v], [u - 1j * v, 1 - q]]) @ fields
+    # Aberration turns directions by 1e-4.
+    assert found == pytest.approx(received[0], abs=1e-3)
 
 
 def test_engines_are_chosen_by_name():

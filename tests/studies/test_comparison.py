@@ -183,6 +183,8 @@ def test_the_answer_is_on_the_report_and_in_python(compared, summaries):
         calstudy.open_run(compared.folder).standings(worlds="ideal")
     with pytest.raises(InputError, match="has no spectra by variant; its numbers are in its tables"):
         _ = calstudy.open_run(compared.folder).spectra
+    with pytest.raises(InputError, match="has no transfer function of one calibration; its numbers are in its tables"):
+        _ = calstudy.open_run(compared.folder).transfer
     assert calstudy.open_run(compared.folder).standings(limit=1e9).loc[(0.2, 0.5)].standing["sky-based"] == "passes"
     page = (compared.folder / "report.html").read_text()
     assert page.index("Which calibrator to trust") < page.index("Scores: ideal")

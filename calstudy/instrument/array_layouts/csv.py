@@ -56,12 +56,11 @@ def read_positions(path: Path, numbered: bool = False) -> Layout:
     """Return the antennas of a table; with `numbered`, raise InputError if it does not number them."""
     if not path.is_file():
         raise InputError(f"instrument.layout.path: there is no file {path}")
-    lines, rows = _read_rows(path)
-    columns = list(rows[0]) if rows else []
+    columns, lines, rows = _read_rows(path)
     geodetic = {"latitude", "longitude"} <= set(columns) and not set(LOCAL) <= set(columns)
     missing = set(GEODETIC if geodetic else LOCAL).difference(columns)
     if missing or len(rows) < 2:
-        lacking = f"; missing: {', '.join(sorted(missing))}" if rows and missing else ""
+        lacking = f"; missing: {', '.join(sorted(missing))}" if columns and missing else ""
         raise InputError(
             f"instrument.layout.path: {path} needs at least two rows with columns east_m, north_m, up_m, or latitude, "
             f"longitude, height_m{lacking}; found: {len(rows)} rows of {', '.join(columns) or 'nothing'}"
@@ -97,8 +96,11 @@ def _whole(text: str) -> int:
     return int(number)
 
 
-def _read_rows(path: Path) -> tuple[list[int], list[dict[str, str]]]:
-    """Return the lines of a table's rows, and the rows by the names in `COLUMNS`; raises InputError if it is none."""
+def _read_rows(path: Path) -> tuple[list[str], list[int], list[dict[str, str]]]:
+    """Return the columns of a table, by the names in `COLUMNS`, and the lines and cells of its rows.
+
+    Raises InputError if the file is no table.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig").splitlines()
         places = [at for at, line in enumerate(text) if line.strip() and not line.lstrip().startswith("#")]
@@ -119,7 +121,7 @@ def _read_rows(path: Path) -> tuple[list[int], list[dict[str, str]]]:
     twice = next((name for name in COLUMNS if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"instrument.layout.path: {path} has the column {twice} twice")
-    return [line for _, line in rows], [dict(zip(names, row, strict=True)) for row, _ in rows]
+    return names, [line for _, line in rows], [dict(zip(names, row, strict=True)) for row, _ in rows]
 
 
 def _about_their_mean(geodetic: np.ndarray, lines: list[int], path: Path) -> tuple[np.ndarray, Place]:

@@ -241,11 +241,24 @@ class PyuvsimEngine(Engine):
 def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVData) -> np.ndarray:
     """Return the visibilities, (Nblts, Nfreqs, Nproducts) complex128; antenna i has the beam ``beams[index[i]]``.
 
-    `pyuvsim.run_uvdata_uvsim` prints and installs an excepthook; this is its loop, and gives the same bits.
+    `pyuvsim.run_uvdata_uvsim` prints and installs an excepthook; this is its loop, and gives the same bits if the sky
+    is not polarized.
     """
     from pyuvdata import BeamInterface
     from pyuvsim import BeamList
     from pyuvsim.uvsim import UVEngine, uvdata_to_task_iter
+
+    class MirroredEngine(UVEngine):
+        update_local_coherency: bool
+
+        def apply_beam(self, beam_interp_check: bool = True) -> None:
+            # pyuvsim 1.4 has coherencies along azimuths from north through east, and multiplies them by beams along
+            # azimuths from east through north, which mirrors Q and U. V has the sign of neither.
+            if self.update_local_coherency:
+                self.local_coherency = self.task.sources.coherency_calc().conj()
+                self.local_coherency[[0, 1], [1, 0]] *= -1
+                self.update_local_coherency = False
+            super().apply_beam(beam_interp_check)
 
     use_bundled_earth_orientation()
     by_antenna = dict(zip(template.telescope.antenna_names, index.tolist(), strict=True))
@@ -255,7 +268,7 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
     listed = BeamList([BeamInterface(beam, beam_type="efield") for beam in beams])
     tasks = range(template.Nblts * template.Nfreqs)
     cube = np.empty((template.Nblts, template.Nfreqs, len(_products(beams[0]))), dtype=np.complex128)
-    engine = UVEngine()
+    engine = MirroredEngine()
     with warnings.catch_warnings():
         # A 21 cm sky is a brightness difference.
         warnings.filterwarnings("ignore", "Some Stokes I values are negative", UserWarning)
