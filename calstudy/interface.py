@@ -66,6 +66,7 @@ from calstudy.studies.load import load_study, study_of
 from calstudy.studies.show import describe_plan, show_plan
 from calstudy.studies.study import Study, run_study
 from calstudy.verdicts.standing import LIMIT
+from calstudy.verdicts.statement import Unevaluated
 
 if TYPE_CHECKING:
     import pandas
@@ -365,24 +366,24 @@ class OpenRun:
     @property
     def transfer(self) -> xarray.Dataset:
         """The transfer function T of the calibration against `region` ("outside-wedge", "inside-wedge") and `k`."""
-        return self._by_region(self._of_variants(ONE_T).transfer)
+        return self._of_one(lambda tables: self._by_region(tables.transfer), ONE_T)
 
     @property
     def transfer_in_bands(self) -> xarray.Dataset:
         """The same in four wide bands of k."""
-        return self._by_region(self._of_variants(ONE_T).transfer_in_bands)
+        return self._of_one(lambda tables: self._by_region(tables.transfer_in_bands), ONE_T)
 
     @property
     def transfer_map(self) -> xarray.Dataset:
         """The transfer function against `baseline_length` and `delay`."""
-        return by_length_and_delay(self._of_variants(ONE_T).transfer_map())
+        return by_length_and_delay(self._of_one(lambda tables: tables.transfer_map(), ONE_T))
 
     @property
     def scores(self) -> pandas.DataFrame:
         """T and bias of the calibration in bands of k, with errors from leaving out antennas; one row for each band."""
         import pandas
 
-        bands = self._of_variants("scores of one calibration").summary["bands"]
+        bands = self._of_one(lambda tables: tables.summary, "scores of one calibration")["bands"]
         rows = [{"k_from": band["k"][0], "k_to": band["k"][1], **band} for band in bands]
         return pandas.DataFrame(rows).drop(columns="k").set_index(["k_from", "k_to"])
 
@@ -509,22 +510,36 @@ class OpenRun:
         try:
             return load_study(self.folder / EXPERIMENT)
         except ExperimentError as error:
-            raise self._folder.not_readable(error) from None
+            # The version that wrote the file accepted it.
+            commit = self._folder.manifest.get("git_commit")
+            writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
+            raise InputError(
+                f"{self.folder / EXPERIMENT}: written on {self._folder.finished:%d %B %Y} by {writer}; this version "
+                f"refuses it, so run the experiment again, or read the run with that version ({error})"
+            ) from None
 
     @property
     def _experiment(self) -> ExperimentStudy:
         return _single(self._study)
 
-    def _of_variants(self, wanted: str) -> Tables:
-        """Return the tables of a run of one experiment; raises InputError, with where what is wanted is, of others."""
+    def _has_no(self, wanted: str) -> InputError:
+        has_tables = "its numbers are in its tables" if self.tables else "run the experiment again"
+        return InputError(f"{self.name}: has no {wanted}; {'take one of its parts' if self.parts else has_tables}")
+
+    def _of_one(self, read: Callable[[Tables], R], wanted: str) -> R:
+        """Read what a run of one experiment has; raises InputError, with where it is, of a run of several."""
         tables = self._folder.tables
-        if not tables.variants:
-            has_tables = "its numbers are in its tables" if self.tables else "run the experiment again"
-            raise InputError(f"{self.name}: has no {wanted}; {'take one of its parts' if self.parts else has_tables}")
-        return tables
+        try:
+            return read(tables)
+        except Unevaluated:
+            if tables.variants or tables.lost:
+                raise
+            raise self._has_no(wanted) from None
 
     def _by_variant(self, read: Callable[[str], Any]) -> ByVariant:
-        return ByVariant(self._of_variants("spectra by variant").variants, read)
+        if not (names := self._folder.tables.variants):
+            raise self._has_no("spectra by variant")
+        return ByVariant(names, read)
 
     def _spherical(self, modes: str) -> ByVariant:
         return self._by_variant(lambda name: by_wavenumber(self._folder.tables.spherical(name, modes)))
@@ -583,8 +598,6 @@ def _read_table(path: Path) -> pandas.DataFrame:
     import pandas
 
     text = path.read_text(encoding="utf-8")
-    if not text.endswith("\n"):
-        raise ValueError("the end is missing")
     # A line above the header describes the sky model; cells may have the sign as well.
     return pandas.read_csv(StringIO(text), skiprows=int(text.startswith("# ")))
 

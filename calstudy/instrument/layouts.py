@@ -220,7 +220,7 @@ def require_valid(made: Layout, origin: str) -> None:
     if not np.isfinite(made.enu).all():
         raise InputError(f"{origin}: positions must be finite")
     width = np.ptp(made.enu, axis=0).max()
-    if np.abs(made.enu).max() > FARTHEST or (count > 2 and RESOLVED < width < SMALLEST):
+    if np.abs(made.enu).max() > FARTHEST or (count > 2 and 0 < width < SMALLEST):
         raise InputError(
             f"{origin}: antennas are up to {np.abs(made.enu).max():.4g} m from the origin, and the array is "
             f"{width:.4g} m wide; give east, north and up of a place in the array, in metres, "

@@ -20,16 +20,17 @@ from calstudy.products.files import GAINS
 class Gains:
     """Gains of all antennas.
 
-    Antenna numbers are ascending, (Nants,), channel centres in Hz, (Nfreqs,), Julian dates ascending, (Ntimes,). Values
-    are complex, (Ntimes, Nants, Nfreqs), or (1, Nants, Nfreqs) without dates for gains that are constant during the
-    run; flags of the same shape mark missing solutions.
+    Antenna numbers are ascending, (Nants,), channel centres in Hz, (Nfreqs,). Values are complex, (Ntimes, Nants,
+    Nfreqs), or (1, Nants, Nfreqs) for gains that are constant during the run; flags of the same shape mark missing
+    solutions. Times are Julian dates, (Ntimes,), None for constant gains; `integration` is the duration of one, s.
     """
 
     numbers: np.ndarray
     frequency: np.ndarray
-    times: np.ndarray | None
     values: np.ndarray
     flags: np.ndarray
+    times: np.ndarray | None
+    integration: float
 
     def at(self, integration: int, numbers: Sequence[int] | np.ndarray) -> np.ndarray:
         """Return the gains of some antennas at one integration of the run, (len(numbers), Nfreqs)."""
@@ -66,7 +67,8 @@ def read_gains(folder: Path, polarization: int = 0) -> Gains:
     cal = UVCal.from_file(folder / GAINS)
     order = np.argsort(cal.ant_array)
     values, flags = (np.moveaxis(array[order][..., polarization], 2, 0) for array in (cal.gain_array, cal.flag_array))
-    return Gains(cal.ant_array[order], cal.freq_array, cal.time_array, values, flags)
+    integration = float(np.ravel(cal.integration_time)[0])
+    return Gains(cal.ant_array[order], cal.freq_array, values, flags, cal.time_array, integration)
 
 
 def true_of(true: Path | None, fitted: Gains, polarization: int = 0) -> np.ndarray:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calstudy.base.constants import SECONDS_PER_DAY
 from calstudy.base.files import json_number
 from calstudy.base.resources import COMPLEX128, LIBRARIES_MEMORY, Cost
 from calstudy.base.table import Table
@@ -343,8 +342,7 @@ class FluxScale(Task, stage="flux-scale", version=1):
         values = np.where(fitted.flags, np.nan, fitted.values)
         if self.blocks == 1 or fitted.times is None:
             return gain_ratio(true, values)
-        integration = float(np.median(np.diff(fitted.times))) * SECONDS_PER_DAY
-        blocks = divide(fitted.times, integration, self.blocks)
+        blocks = divide(fitted.times, fitted.integration, self.blocks)
         return np.concatenate([gain_ratio(true[block.times], values[block.times]) for block in blocks])
 
     def _cost(self) -> Cost:

@@ -379,16 +379,7 @@ class RunFolder:
         try:
             return validate({key: value for key, value in self.content.items() if key not in without}, self.path)
         except ExperimentError as error:
-            raise self.not_readable(error) from None
-
-    def not_readable(self, error: ExperimentError) -> InputError:
-        """Return the error that experiment.yaml, which the version that wrote it accepted, is refused."""
-        commit = self.manifest.get("git_commit")
-        writer = f"calstudy at commit {commit[:7]}" if commit else "another version of calstudy"
-        return InputError(
-            f"{self.path / EXPERIMENT}: written on {self.finished:%d %B %Y} by {writer}; this version refuses it, so "
-            f"run the experiment again, or read the run with that version ({error})"
-        )
+            raise ExperimentError([f"{self.path / EXPERIMENT}: {fault}" for fault in error.faults]) from None
 
     @property
     def tables(self) -> Tables:

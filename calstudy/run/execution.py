@@ -518,7 +518,7 @@ def _end_announced(workers: Workers, warn: Callable[[str], None]) -> Iterator[No
         yield
     except (KeyboardInterrupt, SystemExit):
         if workers.count == 1 and workers.scheduler is None:
-            warn("the run ends when the product that it is making is finished")
+            warn("the run ends when the product that it is making, or waits for, is finished")
         raise
 
 

@@ -22,8 +22,8 @@ from calstudy.experiment.files import override, validate
 from calstudy.instrument.layouts import size_of_instrument
 from calstudy.instrument.telescope import make_template
 from calstudy.power.delay import make_taper
-from calstudy.products import agreement, corruption, signal_loss
-from calstudy.products.files import AGREEMENT, read_json
+from calstudy.products import agreement, calibration, corruption, signal_loss, spectra
+from calstudy.products.files import AGREEMENT, RESIDUAL, read_json, read_visibilities
 from calstudy.products.graph import Graph
 from calstudy.products.selection import read_gains
 
@@ -318,23 +318,26 @@ def test_a_run_with_drifting_gains_is_compared_with_the_gains_of_each_integratio
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("blocks", [1, 2])
-def test_the_flux_scale_is_that_of_the_blocks_of_the_spectra(tmp_path, blocks):
-    """Gains that turn between blocks, and are not calibrated, cancel in an average of both, and not in either power."""
+@pytest.mark.parametrize("longest", [None, "30 s"])
+def test_the_flux_scale_is_that_of_the_blocks_of_the_spectra(tmp_path, longest):
+    """Gains that turn between blocks, and are not calibrated, cancel in an average of all, and not in their powers."""
     drift = {"kind": "random-walk", "amplitude": 0.4, "phase": "0.5 rad", "time": "10 s"}
     data = override(tiny(tmp_path), "corruption.effects", [{"kind": "per-channel-gains", "drift": drift}])
     data = override(data, "calibration", {"calibrator": "none"})
-    experiment = validate(data, tmp_path)
-    if blocks == 2:
-        duration = f"{experiment.instrument.times.integration} s"
-        experiment = validate(override(data, "power.coherent_time", duration), tmp_path)
+    # The third of five integrations is in the middle of the run, at the edge of two blocks.
+    data = override(override(data, "instrument.times.count", 5), "instrument.times.integration", "10 s")
+    experiment = validate(override(data, "power.coherent_time", longest), tmp_path)
     graph = Graph(experiment)
-    tasks = [signal_loss._flux_scale(graph), corruption.gains(graph)]
+    residual = experiment.variants["residual"]
+    average = spectra.average(graph, residual, "even")
+    tasks = [signal_loss._flux_scale(graph), corruption.gains(graph), calibration.calibration(graph, residual, "even")]
     products = [make([task], tmp_path)[task.key].path for task in tasks]
     gains = read_gains(products[1]).values
+    blocks = average.blocks_of(read_visibilities(products[2] / RESIDUAL))
+    assert sorted(block.times.size for block in blocks) == ([5] if longest is None else [2, 3])
     first, second = np.triu_indices(gains.shape[1], 1)
     ratios = gains[:, first] * gains[:, second].conj()
     taper = make_taper(experiment.power.taper, gains.shape[2]) ** 2
-    of_blocks = np.abs(ratios if blocks == 2 else ratios.mean(axis=0)) ** 2
+    of_blocks = np.abs([ratios[block.times].mean(axis=0) for block in blocks]) ** 2
     expected = (of_blocks @ taper).mean() / taper.sum()
     assert read_json(products[0] / signal_loss.SCALE)["flux_scale"] == pytest.approx(expected**-0.5, rel=1e-6)

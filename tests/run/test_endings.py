@@ -209,7 +209,7 @@ def test_sigterm_ends_a_run_as_an_interrupt_with_a_status_of_its_own(tmp_path):
         said, message = process.communicate(timeout=120)
     assert process.returncode == 143
     assert message.strip() == "calstudy: terminated; what is in the store is kept, and a run goes on from there"
-    assert "the run ends when the product that it is making is finished" in said
+    assert "the run ends when the product that it is making, or waits for, is finished" in said
     [log] = tmp_path.glob(f"runs/*/{LOG}")
     assert "ended with status 143: SIGTERM" in log.read_text()
 

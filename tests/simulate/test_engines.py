@@ -217,7 +217,10 @@ def test_auto_takes_the_fastest_that_can(sky, template, tile_beam):
 @pytest.mark.parametrize("altitude", [1.5, 0.6])
 @pytest.mark.parametrize("fractions", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0.2, -0.3, 0.4)])
 def test_a_polarized_source_is_received_along_its_own_field(dipole_beam, altitude, azimuth, fractions):
-    """<E_N E_N*> = (I + Q) / 2, <E_E E_E*> = (I - Q) / 2, <E_N E_E*> = (U + iV) / 2 (IAU), on dipoles along x and y."""
+    """<E_N E_N*> = (I + Q) / 2, <E_E E_E*> = (I - Q) / 2, <E_N E_E*> = (U + iV) / 2, on dipoles along x and y.
+
+    Q and U are those of the IAU. The sign of V, that of pyuvsim, depends on the sign of phases in time.
+    """
     template = observe(count=2, channels=1, times=1)
     template.polarization_array = np.array([-5, -7])  # xx and xy
     place = local_coordinates(template, np.array([altitude]), np.array([azimuth]))

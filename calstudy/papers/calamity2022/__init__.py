@@ -62,7 +62,7 @@ class Calamity2022(Paper):
         "redundant": "redundant",
         "redundant_modelling": "redundant-modelling",
         "low_snr": "lowsnr",
-        "other_channels": "minredundant-160-khz",
+        "other_channels": "minredundant-320-khz",
         "paper_solver": "minredundant-adamax",
         "redundant_paper_solver": "redundant-adamax",
         "low_snr_paper_solver": "lowsnr-adamax",

@@ -222,7 +222,7 @@ def loss_depends_on_channels(run: Results, other: Results) -> Finding:
     "what is not corrected stays above the EoR",
 )
 def leakage_is_not_corrected(run: Results) -> Finding:
-    raise Unevaluated("the simulated sky is not polarized")
+    raise Unevaluated("the sky of the paper's studies is not polarized, and that of others is not looked at")
 
 
 @CAVEATS.states(
