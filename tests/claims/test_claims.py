@@ -345,7 +345,7 @@ def test_what_no_run_can_tell_has_a_reason(make_study):
         ("one-complex-degeneracy", "step 2.1 of the validation ladder"),
         ("artefacts-at-minus-45-db", "the figure 'delay-floor' measures it"),
         ("average-loses-nothing", "needs realizations"),
-        ("leakage-is-not-corrected", "the simulated sky is not polarized"),
+        ("leakage-is-not-corrected", "the sky of the paper's studies is not polarized"),
         ("filter-rescues-coupling", "no filter in fringe rate"),
     ):
         assert claims[name].verdict == "not evaluated"
