@@ -65,9 +65,7 @@ def test_all_that_is_drawn_has_secret_seeds_of_its_own_in_every_world(blind_worl
         used = [content["sky"]["foregrounds"]["seed"], content["sky"]["eor"]["seed"]]
         used += seeds_in(content["corruption"])
         built = content["instrument"]["as_built"]
-        used += [
-            block["seed"] for block in built.values() if case.world != "1" and block and block.get("scatter")
-        ]
+        used += [block["seed"] for block in built.values() if case.world != "1" and block and block.get("scatter")]
         assert set(used) <= set(drawn)
 
 
