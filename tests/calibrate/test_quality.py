@@ -128,6 +128,7 @@ def test_with_autocorrelations_chi2_is_in_units_of_the_radiometer_equation(clean
     absorbed[:, :, CHANNEL] *= 4
     (warning,) = assess(data, result_of(clean, 1e-4 * sigma * absorbed)).warnings
     assert "chi^2 is 1e-08 per sample: the fit has about as many unknowns as there are samples" in warning
+    assert "or the noise is far below that of the autocorrelations" in warning
 
 
 def measured(toy: Toy) -> tuple[UVData, UVData]:
