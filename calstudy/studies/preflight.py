@@ -175,10 +175,10 @@ def _no_groups(experiment: Experiment) -> str:
     if not isinstance(calibration, ForegroundFit) or calibration.reference != "calamity-redundant":
         return ""
     vectors, tolerance = frame_of(assumed_world(experiment).instrument).vectors, calibration.redundancy_tolerance
-    # Without the library that finds groups, which takes a second to import: baselines of one direction, in cells of two
-    # grids that are shifted by half a cell.
+    # Without the library that finds groups, which takes a second to import: baselines of one direction, in the cells of
+    # four grids that are shifted by a quarter. In a coordinate, neighbours are in different cells of one grid at most.
     vectors = vectors * np.where(vectors @ [1, 1e-3, 1e-6] < 0, -1, 1)[:, None] / (2 * tolerance)
-    shared = any(len(np.unique(np.round(vectors + shift), axis=0)) < len(vectors) for shift in (0, 0.5))
+    shared = any(len(np.unique(np.round(vectors + shift), axis=0)) < len(vectors) for shift in (0, 0.25, 0.5, 0.75))
     if not experiment.calibrates or shared:
         return ""
     return (

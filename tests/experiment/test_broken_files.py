@@ -307,12 +307,14 @@ def test_a_model_for_each_group_of_an_array_without_groups_is_noted_in_a_plan(tm
     )
     told = "calibration.calibrator = 'calamity-redundant': no two baselines are within"
     assert told not in " ".join(planned(capsys).split())
-    Path("random.csv").write_text("east_m,north_m,up_m\n0,0,0\n14,3,0\n-6,19,0\n31,-8,0\n")
-    assert told in " ".join(
-        planned(
-            capsys, "--set", "instrument.layout={kind: csv, path: random.csv}", "--set", "instrument.location=mwa"
-        ).split()
-    )
+    at = ("--set", "instrument.layout={kind: csv, path: some.csv}", "--set", "instrument.location=mwa")
+    for positions, alone in (
+        ("0,0,0\n14,3,0\n-6,19,0\n31,-8,0\n", True),
+        # Two baselines that differ by nanometres, on edges of cells in one coordinate and in another.
+        ("0,0,0\n14.5,0,1e-9\n29.000000001,0,-1e-9\n", False),
+    ):
+        Path("some.csv").write_text(f"east_m,north_m,up_m\n{positions}")
+        assert (told in " ".join(planned(capsys, *at).split())) is alone
 
 
 def test_a_run_shows_the_notes_of_its_plan(tmp_path, capsys, monkeypatch):

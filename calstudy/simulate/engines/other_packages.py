@@ -253,7 +253,7 @@ def _visibilities(sky: SkyModel, beams: list, index: np.ndarray, template: UVDat
 
         def apply_beam(self, beam_interp_check: bool = True) -> None:
             # pyuvsim 1.4 has coherencies along azimuths from north through east, and multiplies them by beams along
-            # azimuths from east through north, which mirrors Q and U. V keeps its sign of pyuvsim.
+            # azimuths from east through north, which mirrors Q and U. V keeps the sign that pyuvsim gives it.
             if self.update_local_coherency:
                 self.local_coherency = self.task.sources.coherency_calc().conj()
                 self.local_coherency[[0, 1], [1, 0]] *= -1
